@@ -7,13 +7,9 @@ tile codes) are computed on loading. Letters: E games, N agents, W columns and r
 
 from __future__ import annotations
 
-import math
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import pairwise
 from threading import Timer
 from typing import Any, Final
 
@@ -34,7 +30,7 @@ from hecogrid_envs.constants import STEP as STEP_AHEAD
 from hecogrid_envs.core.occupancy import arrive, plane_offset
 from hecogrid_envs.core.rng import fresh_seed, generator_word
 from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers, Games, World
-from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams
+from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, whole_number
 from hecogrid_envs.state import StateMapping, check_state, state_of
 from hecogrid_envs.task import DECLARED, TaskName, check_task
 from hecogrid_envs.tiles import FIRST_TERRAIN, INVISIBLE, turned_atlases
@@ -51,23 +47,6 @@ SLACK: Final = 64
 
 #: Visibility in views of at most this many columns is looked up in a table.
 _TABLED_COLUMNS: Final = 8
-
-#: Size of a cache line in bytes.
-_CACHE_LINE: Final = 64
-
-
-def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike, value: int = 0) -> npt.NDArray[Any]:
-    """
-    Make an array that shares no cache line with another array.
-
-    If games divide evenly between threads, no two threads write to the same line (no false sharing).
-    """
-    n_bytes = math.prod((shape,) if isinstance(shape, int) else shape) * np.dtype(dtype).itemsize
-    memory = np.empty(n_bytes + 2 * _CACHE_LINE, dtype=np.uint8)
-    start = -memory.ctypes.data % _CACHE_LINE
-    array = memory[start : start + n_bytes].view(dtype).reshape(shape)
-    array[...] = value
-    return array
 
 
 def world_of(task: TaskName, params: HECOGridParams) -> World:
@@ -145,26 +124,26 @@ def empty_games(world: World, n_games: int) -> Games:
     """Return E games that have not begun."""
     agents, cells = (n_games, world.n_agents), (n_games, world.width * world.width)
     games = Games(
-        rng=aligned(n_games, np.uint64),
-        terrain=aligned(cells, np.uint8),
-        head=aligned(cells, np.int16, -1),
-        tail=aligned(cells, np.int16, -1),
-        crowd=aligned(cells, np.int16),
-        after=aligned(agents, np.int16, -1),
-        before=aligned(agents, np.int16, -1),
-        x=aligned(agents, np.int32, 1),
-        y=aligned(agents, np.int32, 1),
-        direction=aligned(agents, np.uint8),
-        has_key=aligned(agents, np.uint8),
-        colour=aligned(agents, np.uint8),
-        order=aligned(agents, np.int32),
-        sight=aligned(n_games * world.n_agents * world.view_size, np.uint64),
-        sight_known=aligned(agents, np.uint8),
-        planes=aligned(n_games * 4 * world.plane_bytes, np.uint8),
-        wall_bits=aligned(n_games * 4 * world.bits_bytes, np.uint8),
-        steps=aligned(n_games, np.int32),
-        collected=aligned(n_games, np.int32),
-        collected_now=aligned(n_games, np.int32),
+        rng=np.zeros(n_games, dtype=np.uint64),
+        terrain=np.zeros(cells, dtype=np.uint8),
+        head=np.full(cells, -1, dtype=np.int16),
+        tail=np.full(cells, -1, dtype=np.int16),
+        crowd=np.zeros(cells, dtype=np.int16),
+        after=np.full(agents, -1, dtype=np.int16),
+        before=np.full(agents, -1, dtype=np.int16),
+        x=np.full(agents, 1, dtype=np.int32),
+        y=np.full(agents, 1, dtype=np.int32),
+        direction=np.zeros(agents, dtype=np.uint8),
+        has_key=np.zeros(agents, dtype=np.uint8),
+        colour=np.zeros(agents, dtype=np.uint8),
+        order=np.zeros(agents, dtype=np.int32),
+        sight=np.zeros(n_games * world.n_agents * world.view_size, dtype=np.uint64),
+        sight_known=np.zeros(agents, dtype=np.uint8),
+        planes=np.zeros(n_games * 4 * world.plane_bytes, dtype=np.uint8),
+        wall_bits=np.zeros(n_games * 4 * world.bits_bytes, dtype=np.uint8),
+        steps=np.zeros(n_games, dtype=np.int32),
+        collected=np.zeros(n_games, dtype=np.int32),
+        collected_now=np.zeros(n_games, dtype=np.int32),
     )
     games.order[...] = np.arange(world.n_agents)
     games.planes.reshape(n_games, -1)[...] = world.blank_planes  # the outer wall and what lies beyond it stay
@@ -236,16 +215,14 @@ class GameBatch:
     :param task: a name in :data:`hecogrid_envs.TASK_NAMES`, such as ``"TeamSupport"``
     :param params: parameters of all games
     :param n_games: E
-    :param n_threads: threads that share steps and views, the calling one included; results do not depend on it
     :raises ValueError: for an unknown task or objects that do not fit on the map
     """
 
-    def __init__(self, task: str, params: HECOGridParams, n_games: int = 1, n_threads: int = 1):
+    def __init__(self, task: str, params: HECOGridParams, n_games: int = 1):
         self.task: TaskName = check_task(task)
         params.check_fits(self.task)
         self.params = params
-        self.n_games = _positive("n_games", n_games)
-        self.n_threads = _positive("n_threads", n_threads)
+        self.n_games = whole_number("n_games", n_games, 1, 2**31 - 1)
         self._world = world_of(self.task, params)
         self._games = empty_games(self._world, self.n_games)
         self._seeded = np.zeros(self.n_games, dtype=bool)
@@ -255,15 +232,10 @@ class GameBatch:
         self._view_task = TILES if tiles else PICTURES
         self._view_shape = (n, v, v) if tiles else (n, pixels, pixels, 3)
         self._buffers = Buffers(
-            actions=aligned(self.n_games * n, np.uint8),
-            fresh=aligned(self.n_games, np.uint8),
-            codes=aligned(self.n_games * n * v * v, np.uint8),
+            actions=np.zeros(self.n_games * n, dtype=np.uint8),
+            fresh=np.zeros(self.n_games, dtype=np.uint8),
+            codes=np.zeros(self.n_games * n * v * v, dtype=np.uint8),
         )
-        edges = np.linspace(0, self.n_games, min(self.n_threads, self.n_games) + 1).astype(int).tolist()
-        #: First game, and one beyond the last, of each thread.
-        self._parts = list(pairwise(edges))
-        self._pool: ThreadPoolExecutor | None = None
-        self._pool_process = 0
         self._kernel = self._compiled_kernel()
 
     def _compiled_kernel(self) -> Callable[..., None]:
@@ -283,36 +255,23 @@ class GameBatch:
         return kernel
 
     def __getstate__(self) -> dict[str, Any]:
-        # Threads and compiled code cannot be pickled; a copy creates its own.
-        return {name: value for name, value in self.__dict__.items() if name not in ("_pool", "_kernel")}
+        return {name: value for name, value in self.__dict__.items() if name != "_kernel"}  # which cannot be pickled
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _pool=None)
+        self.__dict__.update(state)
         self._kernel = self._compiled_kernel()
 
-    def _play(self, task: int, views: U8, last_views: U8, first: int, end: int) -> None:
+    def _play(
+        self, task: int, views: U8 = _NO_VIEWS, last_views: U8 = _NO_VIEWS, first: int = 0, end: int | None = None
+    ) -> None:
         """
-        Do one task for games ``first`` to ``end - 1``; see :func:`hecogrid_envs.core.play.play`.
+        Do one task for games ``first`` to ``end - 1``, all by default; see :func:`hecogrid_envs.core.play.play`.
 
         :param views: (end - first, ...), or empty
         :param last_views: (end - first, ...), or empty
         """
-        own, last = views.reshape(-1), last_views.reshape(-1)
+        own, last, end = views.reshape(-1), last_views.reshape(-1), self.n_games if end is None else end
         self._kernel(self._games, self._world, self._buffers, task, own, last, first, end)
-
-    def _play_all(self, task: int, views: U8 = _NO_VIEWS, last_views: U8 = _NO_VIEWS) -> None:
-        """Do one task for all games, split between the threads; arguments as in :meth:`_play`."""
-        (first, end), *others = self._parts
-        if not others:
-            self._play(task, views, last_views, first, end)
-            return
-        if self._pool is None or self._pool_process != os.getpid():  # threads do not survive a fork
-            self._pool = ThreadPoolExecutor(len(others), "hecogrid")
-            self._pool_process = os.getpid()
-        running = [self._pool.submit(self._play, task, views[i:j], last_views[i:j], i, j) for i, j in others]
-        self._play(task, views[first:end], last_views[first:end], first, end)
-        for part in running:
-            part.result()
 
     def reset(self, which: npt.NDArray[np.bool_] | None = None, seeds: Sequence[int | None] | None = None) -> None:
         """
@@ -327,7 +286,7 @@ class GameBatch:
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
         self._buffers.fresh[...] = chosen
-        self._play_all(RESET)
+        self._play(RESET)
 
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:
@@ -344,12 +303,12 @@ class GameBatch:
         :param actions: (E, N) integers from 0 to 6
         """
         self._accept(actions)
-        self._play_all(STEP)
+        self._play(STEP)
 
     def _step_checked(self, actions: npt.NDArray[np.uint8]) -> None:
         """As :meth:`step`, without checking the actions: a second check takes a tenth of a single game's step."""
         self._take(actions)
-        self._play_all(STEP)
+        self._play(STEP)
 
     def observe(self, out: U8 | None = None) -> U8:
         """
@@ -359,7 +318,7 @@ class GameBatch:
         :return: (E, N, V, V) tile codes or (E, N, V t, V t, 3) pixels, as ``params.observation`` says
         """
         out = self._array_for_views("out", out)
-        self._play_all(self._view_task, out)
+        self._play(self._view_task, out)
         return out
 
     def advance(
@@ -381,7 +340,7 @@ class GameBatch:
         self._accept(actions)
         out = self._array_for_views("out", out)
         last_views = _NO_VIEWS if last is None else self._array_for_views("last", last)
-        self._play_all(STEP | RESTART | self._view_task, out, last_views)
+        self._play(STEP | RESTART | self._view_task, out, last_views)
         return out, self._buffers.fresh.astype(bool)
 
     def _accept(self, actions: npt.NDArray[np.integer[Any]]) -> None:
@@ -424,21 +383,13 @@ class GameBatch:
 
         :return: as :meth:`observe` without its first axis
         """
-        return self._views_of_game(self._checked(game), self._view_task, self._view_shape)
+        return self._views_of_game(game, self._view_task, self._view_shape)
 
     def _views_of_game(self, game: int, task: int, shape: tuple[int, ...]) -> U8:
+        game = whole_number("game", game, 0, self.n_games - 1)
         out = np.empty(shape, dtype=np.uint8)
-        self._play(task, out, _NO_VIEWS, game, game + 1)
+        self._play(task, out, first=game, end=game + 1)
         return out
-
-    def _checked(self, game: int) -> int:
-        if (
-            isinstance(game, (bool, np.bool_))
-            or not isinstance(game, (int, np.integer))
-            or not 0 <= game < self.n_games
-        ):
-            raise ValueError(f"game must be an integer from 0 to {self.n_games - 1}, got {game!r}")
-        return int(game)
 
     @property
     def rewards(self) -> npt.NDArray[np.float64]:
@@ -472,7 +423,7 @@ class GameBatch:
 
     def get_state(self, game: int = 0) -> StateMapping:
         """Copy the state of one game (see :class:`~hecogrid_envs.state.StateMapping`)."""
-        game = self._checked(game)
+        game = whole_number("game", game, 0, self.n_games - 1)
         games = self._games
         return state_of(*(each[game] for each in (games.terrain, games.x, games.y, games.direction, games.has_key)))
 
@@ -483,7 +434,7 @@ class GameBatch:
         :param mapping: see :class:`~hecogrid_envs.state.StateMapping`
         :raises ValueError: naming the first fault of an inconsistent mapping
         """
-        game = self._checked(game)
+        game = whole_number("game", game, 0, self.n_games - 1)
         state = check_state(mapping, self.params)
         games, width = self._games, self.params.grid_size
         self._seed(game, None)
@@ -496,7 +447,7 @@ class GameBatch:
         games.x[game], games.y[game] = state["agent_pos"].T
         games.direction[game] = state["agent_dir"]
         games.has_key[game] = state["agent_has_key"]
-        self._play(BEGIN, _NO_VIEWS, _NO_VIEWS, game, game + 1)
+        self._play(BEGIN, first=game, end=game + 1)
 
     def snapshot(self) -> dict[str, npt.NDArray[Any]]:
         """
@@ -516,7 +467,7 @@ class GameBatch:
         """
         check_snapshot(snapshot, self.snapshot(), self.params)
         load_snapshot(self._games, self._world, snapshot)
-        self._play_all(REDRAW)
+        self._play(REDRAW)
         self._seeded[...] = snapshot["seeded"]
         self._begun = False  # looked up at the next step
 
@@ -528,7 +479,7 @@ class GameBatch:
         """
         state, side, width = self.get_state(game), self.params.view_size, self.params.grid_size
         n_agents, offset = self.params.n_agents, self.params.view_offset
-        codes = self._views_of_game(self._checked(game), TILES, (n_agents, side, side))
+        codes = self._views_of_game(game, TILES, (n_agents, side, side))
         agent, row, column = np.nonzero(codes != INVISIBLE)
         ahead, aside = (side - 1 - offset - row)[:, np.newaxis], (column - side // 2)[:, np.newaxis]
         facing = state["agent_dir"][agent]
@@ -537,9 +488,3 @@ class GameBatch:
         seen = np.zeros((n_agents, width, width), dtype=np.bool_)
         seen[agent[on_map], cells[on_map, 0], cells[on_map, 1]] = True
         return seen
-
-
-def _positive(name: str, value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
-    return int(value)

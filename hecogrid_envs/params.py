@@ -30,6 +30,13 @@ MAX_TILE_SIZE = 128
 MAX_CODED_TILE_SIZE = 10
 
 
+def whole_number(name: str, value: object, low: int, high: int, note: str = "") -> int:
+    """Check that a value is an integer from ``low`` to ``high``; the ValueError names it."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
+        raise ValueError(f"{name} must be an integer from {low} to {high}{note}, got {value!r}")
+    return int(value)
+
+
 @dataclass(frozen=True)
 class HECOGridParams:
     """
@@ -120,10 +127,7 @@ class HECOGridParams:
         return cls(**params)
 
     def _check_integer(self, name: str, low: int, high: int, note: str = "") -> None:
-        value = getattr(self, name)
-        if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
-            raise ValueError(f"{name} must be an integer from {low} to {high}{note}, got {value!r}")
-        object.__setattr__(self, name, int(value))
+        object.__setattr__(self, name, whole_number(name, getattr(self, name), low, high, note))
 
     def check_fits(self, task: TaskName) -> None:
         """

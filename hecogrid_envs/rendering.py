@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hecogrid_envs.constants import OKABE_ITO, Colour, TreasureState, zone_colour
-from hecogrid_envs.params import HECOGridParams
+from hecogrid_envs.params import HECOGridParams, whole_number
 from hecogrid_envs.task import DECLARED, TaskName
 
 Picture = npt.NDArray[np.uint8]
@@ -86,8 +86,7 @@ def render_scene(scene: Scene, tile_size: int | None = None) -> Picture:
     if tile_size is None:
         tile_size = min(_USUAL_TILE, fit_tile_size(scene.params.grid_size, _LARGEST_SIDE))
     side = scene.params.grid_size
-    if not isinstance(tile_size, (int, np.integer)) or not MIN_TILE <= tile_size <= MAX_TILE:
-        raise ValueError(f"tile_size must be an integer from {MIN_TILE} to {MAX_TILE}, got {tile_size!r}")
+    tile_size = whole_number("tile_size", tile_size, MIN_TILE, MAX_TILE)
     if (side * tile_size) ** 2 > MAX_PIXELS:
         raise ValueError(
             f"a map of {side} x {side} cells at tile_size={tile_size} is more than {MAX_PIXELS} pixels; use "

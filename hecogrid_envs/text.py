@@ -56,14 +56,12 @@ def render_text(
     zones: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
     step: int | None = None,
     collected: int | None = None,
-    legend: bool = True,
 ) -> str:
     """
     Write a state as text.
 
     :param zones: (W,) zone of each column, written above the map as digits and letters
     :param step: game steps so far
-    :param legend: end with a line that explains the characters
     :return: lines, without a final newline
     """
     lines = []
@@ -73,10 +71,7 @@ def render_text(
     if zones is not None:
         lines.append("".join(_ZONE_DIGITS[int(zone) % len(_ZONE_DIGITS)] for zone in zones))
     lines += ["".join(row) for row in _characters(state).T]
-    lines += _agent_lines(state)
-    if legend:
-        lines.append(LEGEND)
-    return "\n".join(lines)
+    return "\n".join([*lines, *_agent_lines(state), LEGEND])
 
 
 def _characters(state: Mapping[str, Any]) -> npt.NDArray[np.str_]:

@@ -20,7 +20,6 @@ if find_spec("stable_baselines3") is not None:
     from sb3_saf.checkpoints.learning import TeamCheckpointCallback, resumable_learn, resume
     from sb3_saf.envs.audit import check_team_env
     from sb3_saf.envs.curriculum import Curriculum, Stage
-    from sb3_saf.envs.game_reader import EqualSpaces
     from sb3_saf.envs.gymnasium_team import GymnasiumTeam
     from sb3_saf.envs.joint_observation import CentralizedValueWrapper
     from sb3_saf.envs.monitor import TeamMonitor
@@ -75,7 +74,6 @@ __all__ = [
     "CheckpointError",
     "Curriculum",
     "EntropySchedule",
-    "EqualSpaces",
     "EvaluationResult",
     "ExportError",
     "FiniteCallback",

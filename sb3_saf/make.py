@@ -34,7 +34,6 @@ class Request(NamedTuple):
     active: bool | None = None
     action_masks: AskMasks = "auto"
     state: bool = False
-    float64: bool = False
     stagger: bool = False
 
 
@@ -50,7 +49,6 @@ def make_team_env(
     active: bool | None = None,
     action_masks: AskMasks = "auto",
     state: bool = False,
-    float64: bool = False,
     team_reward: TeamReward | None = None,
     curriculum: Sequence[Stage] = (),
     stagger: bool = False,
@@ -76,8 +74,8 @@ def make_team_env(
         :mod:`sb3_saf.suites`), a module with ``parallel_env`` ("mpe2.simple_spread_v3"), a function
         ("my_package.my_module:make_env") or an id registered with PettingZoo. Or a PettingZoo ParallelEnv, a Gymnasium
         environment of several agents (:class:`GymnasiumTeam`), or a factory that returns one
-        (``simple_spread_v3.parallel_env``). An environment is copied. Agents with different spaces get equal ones
-        (:class:`EqualSpaces`)
+        (``simple_spread_v3.parallel_env``). An environment is copied. Agents with different spaces get equal ones:
+        observations are padded with zeros, and actions that an agent lacks are masked
     :param n_envs: E, parallel games
     :param seed: the run's seed, which determines the games' seeds; None for random ones. An algorithm's ``seed``
         overrides it
@@ -92,7 +90,6 @@ def make_team_env(
     :param action_masks: ``"auto"`` for masks if the environment gives any (in observations, or in the infos of its
         first reset), True to require them, False for none
     :param state: whether observations have the environment's ``state()``
-    :param float64: whether observations of float64 stay so; they become float32 otherwise, which networks read
     :param team_reward: reward for learning: ``"given"`` is each agent's own reward, ``"sum"`` and ``"mean"`` are over
         the agents of its team; None for the suite's default, ``"given"`` without a suite. Logs and evaluation always
         report the games' rewards, in the suite's unit
@@ -117,7 +114,7 @@ def make_team_env(
         suite = source.suite
         if suite is not None:
             params = {**suite.defaults, **params}
-    request = Request(n_envs, backend, n_cpus, active, action_masks, state, float64, stagger)
+    request = Request(n_envs, backend, n_cpus, active, action_masks, state, stagger)
     make = partial(_make_rows, source, request)
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
@@ -152,8 +149,8 @@ def make_vec_env(
     :param backend: see :func:`make_team_env`
     :param n_cpus: number of processes for the games of ``"supersuit"``
     :param stagger: see :func:`make_team_env`
-    :param params: parameters of the game; for HECOGrid the fields of :class:`~hecogrid_envs.HECOGridParams`,
-        ``render_mode`` as in :func:`hecogrid_envs.parallel_env`, and ``n_threads``, threads of ``"native"``
+    :param params: parameters of the game; for HECOGrid the fields of :class:`~hecogrid_envs.HECOGridParams`, and
+        ``render_mode`` as in :func:`hecogrid_envs.parallel_env`
     :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
     :raises ValueError: for an unknown name, backend or parameter, or a value out of range
     """
@@ -223,8 +220,7 @@ def _make_rows(
                 "when you make it, or pass its factory (such as simple_spread_v3.parallel_env) instead"
             )
         game = partial(source, **params)
-    n_envs, _, n_cpus, _, action_masks, state, float64, _ = request
-    return SuperSuitVecEnv(game, n_envs, seed, n_cpus, active, action_masks, state, float64)
+    return SuperSuitVecEnv(game, request.n_envs, seed, request.n_cpus, active, request.action_masks, request.state)
 
 
 def _make_in_engine(env: TeamEnvironment, request: Request, seed: int | None, params: dict[str, Any]) -> VecEnv:

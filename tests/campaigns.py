@@ -104,11 +104,12 @@ CAMPAIGNS: Final = (
     ),
     _mutated("settings and states, each", "mutated tests/test_mutations.py", 1_000),
     Campaign(
-        "odd configurations under NUMBA_BOUNDSCHECK",
-        f"{PYTEST} tests/test_invariants.py",
-        1_500,
+        "configurations of each game, as in the reference world, under NUMBA_BOUNDSCHECK",
+        f"{PYTEST} tests/test_reference_agreement.py -k kernels",
+        100,
         # Do not use kernels without the check from the disk cache.
-        f"NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR={tempfile.gettempdir()}/sb3_saf_bounds EXAMPLES={{n}}",
+        f"NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR={tempfile.gettempdir()}/sb3_saf_bounds",
+        least=100,
     ),
     Campaign("run of the faults of games, 1 and 2 processes", f"{PYTEST} tests/test_misbehaving_games.py", 1, least=1),
     Campaign("run of threads, forks, copies", f"{PYTEST} tests/test_concurrency.py", 1, least=1),

@@ -27,7 +27,7 @@ for variable, value in {
     os.environ.setdefault(variable, value)
 
 # No deadline: the first example compiles the kernels. In CI the examples are the same in every run.
-# Ten thousand: EXAMPLES=10000 python -m pytest tests/test_invariants.py --timeout 3600
+# Ten thousand: EXAMPLES=10000 python -m pytest tests/test_bad_input.py --timeout 3600
 EXAMPLES = int(os.environ.get("EXAMPLES", "30"))
 settings.register_profile("sb3_saf", deadline=None, max_examples=EXAMPLES, derandomize="CI" in os.environ)
 settings.load_profile("sb3_saf")

@@ -1,12 +1,7 @@
-"""A game is the same for any batch size, other games in the batch, number of threads, and after a snapshot."""
+"""A game is the same for any batch size, other games in the batch, and after a snapshot."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import textwrap
-import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -48,15 +43,6 @@ def test_a_game_does_not_depend_on_its_neighbours(task: str, rules: Any) -> None
     strangers[4] = seeds[4]
     among_strangers = play(GameBatch(task, params, 7), strangers, actions)
     np.testing.assert_array_equal([f[4] for f in among_strangers], [f[4] for f in together])
-
-
-def test_team_together_is_team_support_where_one_agent_collects() -> None:
-    params = HECOGridParams(**{**PARAMS.__dict__, "coordination": 1})
-    actions = np.random.default_rng(0).integers(0, 7, size=(120, 7, 5))
-    games = (play(GameBatch(task, params, 7), game_seeds(5, 7), actions) for task in ("TeamSupport", "TeamTogether"))
-    support, together = ([frame[:, -1] for frame in frames] for frames in games)
-    np.testing.assert_array_equal(support, together)
-    assert np.sum(support) > 0
 
 
 def test_game_seeds_do_not_depend_on_their_number_and_never_repeat() -> None:
@@ -164,50 +150,6 @@ def test_nothing_reads_or_writes_outside_of_its_arrays(name: str) -> None:
     np.testing.assert_equal(batch.snapshot(), before)
 
 
-# --- threads ----------------------------------------------------------------------------------------------------------
-
-
-def batch_of(n_threads: int) -> GameBatch:
-    """Create a batch of seeded games."""
-    batch = GameBatch("TeamSupport", PARAMS, 6, n_threads)
-    batch.reset(seeds=game_seeds(0, 6))
-    return batch
-
-
-def test_threads_end_with_their_batch() -> None:
-    before = set(threading.enumerate())
-    batch = batch_of(3)
-    batch.step(np.zeros((6, 5), dtype=np.uint8))
-    threads = set(threading.enumerate()) - before
-    assert threads
-    del batch
-    end = time.monotonic() + 30
-    while any(thread.is_alive() for thread in threads):
-        assert time.monotonic() < end, "a thread outlives its batch"
-        time.sleep(0.01)
-
-
-@pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="no fork here")
-def test_a_forked_process_plays_on() -> None:
-    script = """
-        import os, numpy as np
-        from tests.test_batch import batch_of
-
-        batch, alone = batch_of(2), batch_of(1)
-        step = np.ones((6, 5), dtype=np.uint8)
-        batch.step(step)
-        child = os.fork()
-        batch.step(step)
-        if child == 0:
-            alone.step(step)
-            alone.step(step)
-            os._exit(0 if (batch.observe() == alone.observe()).all() else 1)
-        raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-    """
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", textwrap.dedent(script)]
-    subprocess.run(command, check=True, timeout=120)
-
-
 # --- snapshots --------------------------------------------------------------------------------------------------------
 
 
@@ -282,9 +224,9 @@ N_BEGUN = 7
 SMALL: dict[str, Any] = {"n_agents": 5, "grid_size": 12, "n_treasures": 40, "max_cycles": 9}
 
 
-def apart_in_time(n_threads: int = 1, **params: Any) -> GameBatch:
+def apart_in_time(**params: Any) -> GameBatch:
     """Create games that end at different steps: they begin one after the other, the last from a given state."""
-    batch = GameBatch("TeamTogether", HECOGridParams(**{**SMALL, **params}), N_BEGUN, n_threads)
+    batch = GameBatch("TeamTogether", HECOGridParams(**{**SMALL, **params}), N_BEGUN)
     batch.reset(seeds=game_seeds(0, N_BEGUN))
     for game in range(N_BEGUN - 1):
         batch.step(np.full((N_BEGUN, 5), 2))
@@ -293,12 +235,11 @@ def apart_in_time(n_threads: int = 1, **params: Any) -> GameBatch:
     return batch
 
 
-@pytest.mark.parametrize("n_threads", [1, 3])
 @pytest.mark.parametrize("rules", ["paper", "released"])
 @pytest.mark.parametrize("observation", ["rgb", "tiles"])
-def test_one_call_does_what_three_do(observation: str, rules: str, n_threads: int) -> None:
+def test_one_call_does_what_three_do(observation: str, rules: str) -> None:
     params: dict[str, Any] = {"observation": observation, "rules": rules, "coordination": 1}
-    apart, at_once = apart_in_time(1, **params), apart_in_time(n_threads, **params)
+    apart, at_once = apart_in_time(**params), apart_in_time(**params)
     out, last = apart.observe(), np.full_like(apart.observe(), 77)
     n_over: list[int] = []
     paid = 0.0
@@ -356,10 +297,9 @@ def test_games_begun_from_a_state_have_randomness_of_their_own() -> None:
     assert not np.array_equal(batch.get_state(0)["walls"], batch.get_state(1)["walls"])
 
 
-@pytest.mark.parametrize("n_threads", [1, 2])
-def test_rows_are_the_games_of_parallel_env_also_where_they_end_at_different_steps(n_threads: int) -> None:
+def test_rows_are_the_games_of_parallel_env_also_where_they_end_at_different_steps() -> None:
     params = {**SMALL, "observation": "tiles"}
-    venv: Any = make_vec_env("TeamSupport", 3, seed=4, n_threads=n_threads, **params)
+    venv: Any = make_vec_env("TeamSupport", 3, seed=4, **params)
     twins = [hecogrid_envs.parallel_env("TeamSupport", **params) for _ in range(3)]
     venv.reset()
     for env, seed in zip(twins, game_seeds(4, 3), strict=True):

@@ -15,14 +15,7 @@ from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.vec_env import find_n_agents
 from tests.team_venv import VECTOR, Array, TeamVenv, see_where, still
-
-
-class AtlasSpace(spaces.Box):
-    """Codes that a policy turns into pixels."""
-
-    def __init__(self, shape: tuple[int, ...], n_codes: int) -> None:
-        super().__init__(0, n_codes - 1, shape, np.uint8)
-        self.atlas = np.zeros((n_codes, 4, 4, 3), dtype=np.uint8)
+from tests.toy_teams import CodeSpace
 
 
 def bytes_of(shape: tuple[int, ...]) -> Callable[[int, int, int, int], Array]:
@@ -67,7 +60,7 @@ def test_rows_of_two_games_with_three_agents() -> None:
         # SB3 takes the views of three agents, (3, 2, 7) bytes, for a channel-last image; the same for (3, 7, 2).
         (spaces.Box(0, 255, (2, 7), np.uint8), bytes_of((2, 7))),
         (spaces.Box(0, 255, (7, 2), np.uint8), bytes_of((7, 2))),
-        (AtlasSpace((7, 7), 200), lambda e, i, k, t: bytes_of((7, 7))(e, i, k, t) % 200),
+        (CodeSpace((7, 7), 200), lambda e, i, k, t: bytes_of((7, 7))(e, i, k, t) % 200),
     ],
     ids=lambda value: None if callable(value) else str(value),
 )
@@ -122,7 +115,7 @@ def test_images_that_sb3_would_transpose_twice() -> None:
 
 def test_codes_are_no_image_even_if_they_look_like_one() -> None:
     see = bytes_of((9, 8, 3))
-    env = CentralizedValueWrapper(TeamVenv(own_space=AtlasSpace((9, 8, 3), 256), see=see))
+    env = CentralizedValueWrapper(TeamVenv(own_space=CodeSpace((9, 8, 3), 256), see=see))
     np.testing.assert_array_equal(env.reset()["obs"][5], see(1, 2, 0, 0))
     assert PPO._wrap_env(env) is env
 

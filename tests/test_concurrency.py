@@ -147,7 +147,7 @@ LEVEL: Final[dict[str, Any]] = {
 
 
 def native(seed: int) -> Any:
-    return make_vec_env("TeamTogether", 6, seed=seed, n_threads=2, **LEVEL)
+    return make_vec_env("TeamTogether", 6, seed=seed, **LEVEL)
 
 
 def supersuit(seed: int) -> Any:
@@ -182,7 +182,7 @@ def test_two_threads_at_once(make: Callable[[int], Any]) -> None:
 def test_processes_that_are_started_in_the_middle_of_an_episode(method: str) -> None:
     makers: list[Callable[[int], Any]] = [native, supersuit]
     expected = [play_alone(make, 0) for make in makers]
-    venvs = [begun(make) for make in makers]  # their threads, if any, are running
+    venvs = [begun(make) for make in makers]
     for venv in venvs:
         played(venv, 3)
     with ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:

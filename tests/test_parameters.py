@@ -10,11 +10,6 @@ from sb3_saf.policies.saf import SAFCritic
 ACTOR, OWN_CRITIC, JOINT_CRITIC, CNN = 25_735, 24_961, 98_689, 1_233_056
 
 
-def test_the_table_has_the_published_numbers() -> None:
-    counted = {row.name: row.counted for row in parameter_table()}
-    assert counted == {"CNN": 1_233_056, "IPPO": 1_740_016, "MAPPO": 2_477_296, "SAF": 2_556_486}
-
-
 def test_safs_projections_and_knowledge_source() -> None:
     policy = paper_policy(saf.DECLARATION)
     critic, pool = policy.value_net, policy.actor
@@ -26,8 +21,9 @@ def test_safs_projections_and_knowledge_source() -> None:
     assert count(pool.policies) == 4 * ACTOR
 
 
-def test_the_text_has_the_account_of_the_difference() -> None:
+def test_the_table_has_the_published_numbers_and_the_account_of_the_difference() -> None:
     lines = [line.split() for line in format_table(parameter_table()).splitlines()]
+    assert lines[1][:2] == ["CNN", "1,233,056"]
     assert lines[2][:4] == ["IPPO", "1,740,016", "1,740,016", "0"]
     assert lines[3][:4] == ["MAPPO", "2,477,296", "2,477,296", "0"]
     assert lines[4][:4] == ["SAF", "2,556,486", "2,698,342", "-141,856"]

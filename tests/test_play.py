@@ -55,8 +55,8 @@ def test_page() -> None:
 
 def test_what_is_not_known_is_left_out() -> None:
     lines = PAGE.splitlines()
-    assert render_text(make_state(), legend=False).splitlines() == lines[2:-1]
-    assert render_text(make_state(), step=0, legend=False).splitlines() == ["step 0", *lines[2:-1]]
+    assert render_text(make_state()).splitlines() == lines[2:]
+    assert render_text(make_state(), step=0).splitlines() == ["step 0", *lines[2:]]
 
 
 @pytest.mark.parametrize(("number", "character"), [(1, "v"), (2, "2"), (9, "9"), (10, "+"), (40, "+")])

@@ -20,12 +20,12 @@ from benchmarks.paper import fill
 from benchmarks.suite_results import PAGE, RAW, TASKS, table
 from sb3_saf import (
     Actor,
-    EqualSpaces,
     RandomPolicy,
     SAFMaskablePolicy,
     TeamRolloutBuffer,
     evaluate_team,
     export_actors,
+    game_seeds,
     inspect_team,
     make_team_env,
     ppo_settings,
@@ -283,17 +283,15 @@ def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
 
 @needs("mpe")
 def test_agents_with_other_spaces_are_padded_and_masked() -> None:
-    game = EqualSpaces(find_environment("mpe/simple_speaker_listener_v4").make_game({}))
-    observations, infos = game.reset(seed=0)
-    own, _ = game.env.reset(seed=0)
-    for agent, n_actions in (("speaker_0", 3), ("listener_0", 5)):
-        size = len(own[agent])
-        np.testing.assert_array_equal(observations[agent][:size], own[agent])
-        assert not observations[agent][size:].any() and len(observations[agent]) == 11
-        assert infos[agent]["action_mask"].tolist() == [1] * n_actions + [0] * (5 - n_actions)
+    task = "mpe/simple_speaker_listener_v4"
+    env = make_team_env(task, n_envs=2, seed=0)
+    rows: Any = env.reset()
+    own, _ = find_environment(task).make_game({}).reset(seed=game_seeds(0, 1)[0])
+    for row, (agent, n_actions) in enumerate({"speaker_0": 3, "listener_0": 5}.items()):
+        np.testing.assert_array_equal(rows["obs"][row], np.pad(own[agent], (0, 11 - len(own[agent]))))
+        assert rows["action_mask"][row].tolist() == [1] * n_actions + [0] * (5 - n_actions)
     with pytest.raises(ValueError, match=r"Discrete\(3\), got \[4\], which is masked"):
-        game.step({"speaker_0": 4, "listener_0": 0})
-    env = make_team_env("mpe/simple_speaker_listener_v4", n_envs=2, seed=0)
+        env.step(np.array([4, 0, 0, 0]))
     evaluate_team(RandomPolicy(env, seed=0), env, 4)  # would raise at a masked action
 
 

@@ -187,21 +187,9 @@ def test_what_cannot_be_buffered() -> None:
         next(make_buffer(env).get())
 
 
-def make_model(algorithm: Any = PPO, buffer: Any = TeamRolloutBuffer, env: Any = None, **kwargs: Any) -> Any:
-    if algorithm is PPO:
-        kwargs = {"batch_size": 30, "n_epochs": 2, **kwargs}
-    env = env or make_env()
-    return algorithm(
-        "MultiInputPolicy", env, n_steps=N_STEPS, seed=5, device="cpu", rollout_buffer_class=buffer, **kwargs
-    )
-
-
-def weights(model: Any) -> dict[str, list[Any]]:
-    return {name: value.tolist() for name, value in model.policy.state_dict().items()}
-
-
 def test_observations_normalised_above_the_wrapper_are_refused() -> None:
-    model = make_model(env=VecNormalize(make_env(), norm_obs_keys=["obs", "team"]))
+    settings: dict[str, Any] = {"n_steps": N_STEPS, "batch_size": 30, "rollout_buffer_class": TeamRolloutBuffer}
+    model = PPO("MultiInputPolicy", VecNormalize(make_env(), norm_obs_keys=["obs", "team"]), **settings)
     with pytest.raises(ValueError, match="change or normalise observations below CentralizedValueWrapper"):
         model.learn(60)
-    make_model(env=CentralizedValueWrapper(VecNormalize(make_env().venv))).learn(60)
+    PPO("MultiInputPolicy", CentralizedValueWrapper(VecNormalize(make_env().venv)), **settings).learn(60)

@@ -20,11 +20,11 @@ PICTURE = spaces.Box(0, 255, (3, 12, 12), np.uint8)
 
 
 class CodeSpace(spaces.Box):
-    """Views as tile codes: 3 x 3 cells of 20 codes, 4 pixels per tile."""
+    """Views as tile codes, 4 pixels per tile."""
 
-    def __init__(self) -> None:
-        super().__init__(0, 19, (3, 3), np.uint8)
-        self.atlas = np.random.default_rng(0).integers(0, 256, (20, 4, 4, 3), dtype=np.uint8)
+    def __init__(self, shape: tuple[int, ...] = (3, 3), n_codes: int = 20) -> None:
+        super().__init__(0, n_codes - 1, shape, np.uint8)
+        self.atlas = np.random.default_rng(0).integers(0, 256, (n_codes, 4, 4, 3), dtype=np.uint8)
 
 
 def samples(space: spaces.Space[Any], count: int, seed: int = 0) -> npt.NDArray[Any]:

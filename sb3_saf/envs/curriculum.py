@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from itertools import accumulate, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,12 +52,8 @@ class Curriculum(TeamVecEnvWrapper):
         self.ends = tuple(accumulate(check_count("game_steps", steps) for steps in game_steps))
         self.stage = 0
         self.game_steps = 0
-        for number, stage in enumerate(stages):
-            self._check_fits(stage, number)
-
-    def _check_fits(self, stage: VecEnv, number: int) -> None:
-        for name in ("num_envs", "observation_space", "action_space"):
-            own, first = getattr(stage, name), getattr(self.stages[0], name)
+        for (number, stage), name in product(enumerate(stages), ("num_envs", "observation_space", "action_space")):
+            own, first = getattr(stage, name), getattr(stages[0], name)
             if own != first:
                 raise ValueError(
                     f"the games of all stages of a curriculum need the same {name}: stage 0 has {first}, stage "

@@ -10,9 +10,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
-from pettingzoo.utils import BaseParallelWrapper
 
-from sb3_saf.envs.audit import Trial, mask_error, observation_of, reset, step_results, without_mask
+from sb3_saf.envs.audit import Trial, mask_error, observation_of, without_mask
 from sb3_saf.networks.encoders import Part, PartsSpace, has_pictures, picture_of, wide_integers
 from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion, Leaf, innermost, padded
 from sb3_saf.teams.rows import (
@@ -41,7 +40,6 @@ class GameReader:
     :param active: whether rows have ``"active"``
     :param action_masks: ``"auto"`` for masks if any, True to require them, False for none
     :param state: whether rows have the game's state
-    :param float64: whether observations of float64 stay so
     :raises ValueError: if actions of different agents cannot be those of one policy, or a requested signal is missing
     """
 
@@ -51,14 +49,13 @@ class GameReader:
         active: bool = False,
         action_masks: AskMasks = "auto",
         state: bool = False,
-        float64: bool = False,
     ) -> None:
         self.agents = trial.agents
         #: Warnings about the game.
         self.notes = list(trial.notes)
         observed, acted, keys = trial.observed.values(), trial.actions, trial.mask_keys
         own_spaces = [without_mask(*entry) for entry in zip(observed, keys.values(), strict=True)]
-        own = own_space(own_spaces, float64)
+        own = own_space(own_spaces)
         if not has_pictures(own) and any(_is_picture(leaf) for space in own_spaces for _, leaf in innermost(space)):
             self.notes.append(
                 "the pictures in the agents' observations are read as plain numbers, without convolutions, because "
@@ -89,7 +86,7 @@ class GameReader:
                     f"or MultiBinary, got {env} with {getattr(env, 'state_space', 'no state_space')}; leave state out, "
                     "or give the environment both"
                 )
-            self._state = Leaf.of(space), own_space([space], float64)
+            self._state = Leaf.of(space), own_space([space])
         #: The form of the rows.
         self.rows = TeamSpaces(
             own,
@@ -180,7 +177,7 @@ class GameReader:
             raise ValueError(f"observation of {agent} {place}: {error}") from None
 
     def mask(
-        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], agent: Any, place: str, is_needed: bool = True
+        self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], agent: Any, place: str, is_needed: bool
     ) -> Array | None:
         """Return an agent's action mask, as in rows; None if it lacks one that is not needed."""
         conversion = self.conversions[agent]
@@ -197,71 +194,16 @@ class GameReader:
             raise mask_error(error, key, f"the {where} of {agent} {place}") from None
 
 
-class EqualSpaces(BaseParallelWrapper[Any, Any, Any]):
-    """
-    Wrapper that gives agents with different spaces equal ones, as ``make_team_env`` does for rows.
-
-    Observations: Boxes with equal numbers of axes are padded with zeros at the end of each axis; other spaces are
-    flattened to vectors by ``gymnasium.spaces.flatten`` and then padded.
-
-    Actions: Discrete spaces are extended to the largest one; MultiDiscrete spaces, also beside Discrete ones, to the
-    largest number of choices of each dimension. What an agent lacks is masked (``infos[agent]["action_mask"]``,
-    combined with the game's own masks) and refused. Boxes are padded; only the agent's own entries reach the game,
-    clipped to its bounds.
-
-    :param env: the game
-    :raises ValueError: if actions are neither all discrete nor all vectors
-    """
-
-    def __init__(self, env: AnyParallelEnv) -> None:
-        super().__init__(env)
-        self._reader = GameReader(Trial(env), float64=True)
-        self.possible_agents = list(self._reader.agents)
-
-    def observation_space(self, agent: Any) -> spaces.Space[Any]:
-        """Return the space of all agents' observations."""
-        return self._reader.rows.own
-
-    def action_space(self, agent: Any) -> spaces.Space[Any]:
-        """Return the space of all agents' actions."""
-        return self._reader.action_space
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Begin an episode (see PettingZoo)."""
-        return self._converted(*reset(self.env, seed, options))
-
-    def step(self, actions: Mapping[Any, Any]) -> tuple[Any, Any, Any, Any, Any]:
-        """Play one step (see PettingZoo)."""
-        conversions = self._reader.conversions
-        own = {agent: conversions[agent].game_action(action) for agent, action in actions.items()}
-        observations, rewards, terminations, truncations, infos = step_results(self.env, self.env.step(own))
-        own, infos = self._converted(observations, infos)
-        return own, rewards, terminations, truncations, infos
-
-    def _converted(self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]) -> tuple[Any, Any]:
-        """Return the observations and infos of observed agents, with masks, if there are any."""
-        seen = [agent for agent in self._reader.agents if observations.get(agent) is not None]
-        own = {agent: self._reader.own(observations, agent, "of EqualSpaces") for agent in seen}
-        shown = {agent: dict(info or {}) for agent, info in infos.items()}
-        for agent in seen if self._reader.rows.n_masked_actions is not None else ():
-            mask = self._reader.mask(observations, infos, agent, "of EqualSpaces", agent in self.env.agents)
-            if mask is not None:
-                shown.setdefault(agent, {})[ACTION_MASK_KEY] = mask
-        return own, shown
-
-
 # ---- spaces of rows
 
 
-def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Space[Any]:
+def own_space(observed: Sequence[spaces.Space[Any]]) -> spaces.Space[Any]:
     """
     Return the space of rows' own observations.
 
     Equal spaces of fixed shape stay, counted from 0, as Stable-Baselines3 encodes and samples them whatever their
     start. Boxes with equal numbers of axes are padded to the largest; all others become vectors, as
-    ``gymnasium.spaces.flatten_space`` makes them.
-
-    :param float64: whether Boxes of float64 stay so
+    ``gymnasium.spaces.flatten_space`` makes them. float64 becomes float32, which networks read.
     """
     first = observed[0]
     are_equal = all(space == first for space in observed)
@@ -275,7 +217,7 @@ def own_space(observed: Sequence[spaces.Space[Any]], float64: bool) -> spaces.Sp
     else:
         vectors = [_flat_space(space) for space in observed]
         own = vectors[0] if are_equal else _common_vector(vectors)
-    if isinstance(own, spaces.Box) and own.dtype == np.float64 and not float64:
+    if isinstance(own, spaces.Box) and own.dtype == np.float64:
         with np.errstate(over="ignore"):
             return spaces.Box(own.low.astype(np.float32), own.high.astype(np.float32), dtype=np.float32)
     return own
@@ -300,11 +242,7 @@ def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
     whole = np.zeros(flat.shape, dtype=np.bool_)
     for part in boxes:
         whole[part.start : part.stop] = wide_integers(part.space).reshape(-1)
-    flat = _with_parts(flat, pictures, whole)
-    if flat.dtype == np.float64 and not any(leaf.dtype == np.float64 for leaf in leaves):
-        # Mixed integers and float32 would give float64, which takes twice the memory.
-        return spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-    return flat
+    return _with_parts(flat, pictures, whole)
 
 
 def _common_box(boxes: Sequence[Any]) -> spaces.Box:
@@ -338,6 +276,9 @@ def _with_parts(vector: spaces.Box, pictures: tuple[Part, ...], whole: Array) ->
 def common_actions(acted: Mapping[Any, spaces.Space[Any]]) -> spaces.Space[Any]:
     """
     Return the action space of rows.
+
+    Where agents differ, Discrete spaces are extended to the largest one; MultiDiscrete spaces, also beside Discrete
+    ones, to the largest number of choices of each dimension; vectors are padded.
 
     :raises ValueError: if actions are neither all discrete nor all vectors
     """

@@ -41,9 +41,11 @@ class SuperSuitVecEnv(TeamVecEnv):
     infos named ``"episode"``, ``"active"``, ``"terminal_observation"`` or ``"TimeLimit.truncated"``, which
     Stable-Baselines3 or this package uses, are renamed: ``"game_episode"``, ...
 
-    Dicts and Tuples of observations become one vector, as by ``gymnasium.spaces.flatten``; agents with different spaces
-    get equal ones (:class:`EqualSpaces`). Discrete and MultiDiscrete are counted from 0 in rows, whatever the ``start``
-    of the game's space. Actions of a Box of integers may be given as floats, which are rounded.
+    Dicts and Tuples of observations become one vector, as by ``gymnasium.spaces.flatten``, and float64 becomes float32.
+    Agents with different spaces get equal ones: observations are padded with zeros, discrete actions that an agent
+    lacks are masked and refused, and of a vector only the agent's own entries reach the game, clipped to its bounds.
+    Discrete and MultiDiscrete are counted from 0 in rows, whatever the ``start`` of the game's space. Actions of a Box
+    of integers may be given as floats, which are rounded.
 
     ``get_attr``, ``set_attr``, ``env_method``, ``env_is_wrapped`` and ``get_images`` take and return rows, as SB3's
     callers expect, and apply to the row's game. ``env_method`` without indices therefore calls a game's method N times:
@@ -70,7 +72,6 @@ class SuperSuitVecEnv(TeamVecEnv):
         ``infos[agent]["action_mask"]``, or if agents differ in their actions; True requires them, False adds none. They
         are taken out of the observations
     :param state: whether rows have the game's ``state()``
-    :param float64: whether observations of float64 stay so; False makes them float32
     :raises ValueError: if the environment is no ParallelEnv or breaks its rules, cannot be copied, its agents have
         actions that one policy cannot take, or a requested signal is missing
     """
@@ -84,11 +85,10 @@ class SuperSuitVecEnv(TeamVecEnv):
         active: bool = False,
         action_masks: AskMasks = "auto",
         state: bool = False,
-        float64: bool = False,
     ) -> None:
         n_games = check_count("n_games", n_games)
         n_cpus = min(check_count("n_cpus", n_cpus), n_games)
-        self._make_game, reader = _factory_and_reader(make_env, n_cpus, active, action_masks, state, float64)
+        self._make_game, reader = _factory_and_reader(make_env, n_cpus, active, action_masks, state)
         for note in reader.notes:
             warnings.warn(note, UserWarning, stacklevel=2)
         self.possible_agents = list(reader.agents)
@@ -273,7 +273,7 @@ class SuperSuitVecEnv(TeamVecEnv):
 
 
 def _factory_and_reader(
-    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks, state: bool, float64: bool
+    make_env: MakeEnv, n_cpus: int, active: bool, action_masks: AskMasks, state: bool
 ) -> tuple[Callable[[], Any], GameReader]:
     """Audit a copy of the game; return a function that makes games, and their reader."""
     make_env = as_parallel(make_env)
@@ -286,7 +286,7 @@ def _factory_and_reader(
         check_is_parallel(example, is_factory)
         trial = Trial(example)
         trial.play()
-        return make_game, GameReader(trial, active, action_masks, state, float64)
+        return make_game, GameReader(trial, active, action_masks, state)
     finally:
         with suppress(Exception):  # of games that must be reset before they are closed
             example.close()

@@ -243,20 +243,12 @@ class PolicyPool(ActorNetwork):
         log_weights, actions = self.evaluate(features, agent)
         return th.cat([log_weights, actions.flatten(1)], dim=1)
 
-    def split(self, parameters: th.Tensor) -> PoolOutput:
-        """
-        Split the result of :meth:`unmixed`.
-
-        :param parameters: (B, U + U P)
-        """
-        log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
-        return PoolOutput(log_weights, flat.reshape(-1, self.n_policies, n_action_parameters(self.action_space)))
-
     def distribution(self, parameters: th.Tensor, masks: th.Tensor | None = None) -> Distribution:
         """See :class:`ActorNetwork`."""
         if masks is None and self.is_categorical_mixture:
             return distribution_of(self.action_space, parameters)
-        log_weights, actions = self.split(parameters)
+        log_weights, flat = parameters[:, : self.n_policies], parameters[:, self.n_policies :]
+        actions = flat.reshape(-1, self.n_policies, n_action_parameters(self.action_space))
         if masks is not None:
             # Masked before mixing, so that masks do not change the selection of policies.
             actions = masked_parameters(self.action_space, actions, masks)

@@ -42,12 +42,7 @@ def own_critic(spec: NetworkSpec, heads: Heads) -> OwnValueHead | TeamCritic:
 
 @dataclass(frozen=True)
 class IPPOParts(TeamParts):
-    """
-    IPPO's actor and critic.
-
-    :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
-    :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector
-    """
+    """IPPO's actor and critic, with the fields of :class:`TeamParts`."""
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic:
         """Make the critic: V_i from z_i."""

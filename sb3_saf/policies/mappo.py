@@ -72,10 +72,8 @@ class MeanCritic(TeamCritic):
 @dataclass(frozen=True)
 class MAPPOParts(TeamParts):
     """
-    MAPPO's actor and critic.
+    MAPPO's actor and critic; other fields are those of :class:`TeamParts`.
 
-    :param heads: ``"shared"`` for one actor and one critic that all agents use, ``"per_agent"`` for one each
-    :param actor_identity: whether a shared actor reads the agent's index as a one-hot vector
     :param agent_identity: whether a shared critic on joint features reads the agent's index as a one-hot vector;
         without it all agents of a team get the same value
     :param critic_input: whether the critic reads the observations of the whole ``"team"`` (None), the agent's own and

@@ -84,12 +84,11 @@ class SAFCritic(TeamCritic):
 @dataclass(frozen=True)
 class SAFParts(MAPPOParts):
     """
-    SAF's actor and critic. Without pool and without knowledge source they are MAPPO's.
+    SAF's actor and critic, without pool and knowledge source MAPPO's; other fields are those of :class:`MAPPOParts`.
 
     :param heads: ``"shared"`` for one critic that all agents use, ``"per_agent"`` for one each. The pool is always
         shared; without pool there is one actor, or one for each agent
     :param actor_identity: whether pool and selection, or a shared actor, read the agent's index as a one-hot vector
-    :param agent_identity: whether a shared critic on joint features reads the agent's index as a one-hot vector
     :param n_policies: U, size of the pool; 1 is the ablation without pool
     :param selection: ``"mixture"`` (exact likelihood) or ``"gumbel"`` (one policy, drawn at every evaluation)
     :param knowledge_source: False is the ablation without knowledge source: MAPPO's critic

@@ -138,12 +138,6 @@ class QPLEXParts:
             return SinglePolicy(spec, self.heads == "per_agent")
         return PolicyPool(spec, self.n_policies, "gumbel", self.latent_dim, self.projection_arch)
 
-    def agent_memory(self, features_dim: int, action_space: spaces.Discrete, n_agents: int) -> AgentMemory | None:
-        """Make each agent's memory, if any."""
-        if self.memory is None:
-            return None
-        return AgentMemory(self.memory, features_dim, int(action_space.n), n_agents, self.memory_size)
-
     def make_mixer(self, state_dim: int, n_agents: int, n_actions: int) -> Mixer:
         """Make the mixer of N agents with as many actions each, for states of size S."""
         if self.mixer == "vdn":
@@ -270,8 +264,10 @@ class QPLEXPolicy(TeamRowsPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         self.features_extractor = self.make_features_extractor()
         self.features_dim = self.features_extractor.features_dim
-        parts, n_agents = self.parts, self.team_spaces.n_agents
-        self.actor_memory = parts.agent_memory(self.features_dim, self.action_space, n_agents)
+        parts, n_agents, n_actions = self.parts, self.team_spaces.n_agents, int(self.action_space.n)
+        self.actor_memory = None
+        if parts.memory is not None:
+            self.actor_memory = AgentMemory(parts.memory, self.features_dim, n_actions, n_agents, parts.memory_size)
         latent_dim = self.features_dim if self.actor_memory is None else self.actor_memory.size
         self.actor = parts.actor(
             NetworkSpec(latent_dim, n_agents, self.action_space, self.net_arch, [], self.activation_fn)
@@ -285,7 +281,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         state = self.team_spaces.state
         self.state_encoder = None if state is None else ObservationEncoder(state, self.features_dim)
         state_dim = self.features_dim * (n_agents if state is None else 1)
-        self.mixer = parts.make_mixer(state_dim, n_agents, int(self.action_space.n))
+        self.mixer = parts.make_mixer(state_dim, n_agents, n_actions)
         learning = [module for module in self.online if module is not None]
         self.target_networks = copy.deepcopy(nn.ModuleList(learning)).requires_grad_(False)
         self.optimizer = self.optimizer_class(  # type: ignore[call-arg]

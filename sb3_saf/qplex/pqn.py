@@ -45,13 +45,8 @@ class PQNParts(QPLEXParts):
 class PQNPolicy(QPLEXPolicy):
     """
     Policy of PQN: :class:`QPLEXPolicy` whose heads normalise their layers, which keeps values stable without target
-    networks, and with VDN's mixer.
+    networks, and with VDN's mixer. Other parameters are those of :class:`QPLEXPolicy`.
 
-    :param observation_space: Dict observation space of ``CentralizedValueWrapper``
-    :param action_space: Discrete, counting from 0
-    :param lr_schedule: learning rate schedule
-    :param net_arch: hidden sizes of the Q heads
-    :param activation_fn: activation of hidden layers
     :param optimizer_class: optimizer; published is RAdam, whose steps take longer than those of Adam
     :param optimizer_kwargs: its arguments without the learning rate; None for ``fused=True`` of Adam
     :param kwargs: other arguments of :class:`QPLEXPolicy`, and fields of :class:`PQNParts`
@@ -99,26 +94,15 @@ class PQN(QPLEX):
     **Units**: ``batch_size`` counts *game steps*, ``rollout_steps`` those of each game. ``total_timesteps`` counts rows
     (game steps times N), as in SB3.
 
+    Other parameters are those of :class:`QPLEX`.
+
     :param policy: ``"PQNPolicy"``
-    :param env: vector environment of teams
     :param mixer: ``"vdn"``, ``"qmix"`` or ``"qplex"``; None uses ``policy_kwargs`` (VDN by default)
-    :param learning_rate: learning rate, or a schedule of it
     :param rollout_steps: T, steps of each game in a rollout
     :param batch_size: game steps of a minibatch, at most all of the rollout; the last one of an epoch may be smaller
     :param n_epochs: passes over each rollout
-    :param gamma: discount per game step
     :param td_lambda: weight of later values in returns: 0 for those of the next step, 1 for whole rollouts
-    :param exploration_fraction: fraction of training over which the probability of random actions decreases
-    :param exploration_initial_eps: probability at the start
-    :param exploration_final_eps: probability after that fraction
-    :param max_grad_norm: maximum norm of the gradient
-    :param stats_window_size: number of team episodes in ``rollout/ep_rew_mean``
-    :param tensorboard_log: folder for TensorBoard; None for none
     :param policy_kwargs: arguments of the policy, see :class:`PQNPolicy`
-    :param verbose: 0 for silence, 1 for information, 2 for debugging
-    :param seed: seed of weights, exploration, minibatches and games
-    :param device: device of the networks
-    :param _init_setup_model: whether to build the networks now
     :raises ValueError: for environments without teams, actions that are not Discrete, and invalid numbers
     """
 

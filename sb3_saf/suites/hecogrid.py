@@ -2,8 +2,8 @@
 HECOGrid, the games of this repository: ``hecogrid/TeamSupport-v0``, or ``TeamSupport`` for short.
 
 Each agent receives its share of the treasures collected in a step, so that the team's return counts treasures.
-Parameters are those of :class:`hecogrid_envs.HECOGridParams`, and ``n_threads``, threads of the engine. Observations
-are tile codes unless ``observation="rgb"``: the same views as one code per cell, in 48 times less memory.
+Parameters are those of :class:`hecogrid_envs.HECOGridParams`. Observations are tile codes unless
+``observation="rgb"``: the same views as one code per cell, in 48 times less memory.
 """
 
 from __future__ import annotations

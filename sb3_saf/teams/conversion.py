@@ -226,14 +226,10 @@ class AgentConversion:
         needs_mask: bool = False,
     ) -> AgentConversion:
         """
-        Describe the conversion between spaces.
+        Describe the conversion between spaces of the game and of rows; ``observation_space`` is without masks.
 
-        :param observation_space: of the agent in the game, without masks
-        :param action_space: of the agent in the game
         :param own: space of a row's own observation
         :param row_actions: action space of rows
-        :param mask_key: key of the mask in observations of the game that have one
-        :param needs_mask: whether the game itself gives the agent action masks
         """
         from gymnasium import spaces
 

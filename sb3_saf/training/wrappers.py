@@ -22,10 +22,9 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_saf.checkpoints.states import load_normalization_statistics, normalization_statistics
 from sb3_saf.envs.curriculum import Stage
-from sb3_saf.envs.game_reader import EqualSpaces
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import SharedReward, TeamMonitor, TeamReward
-from sb3_saf.networks.encoders import PartsSpace, has_pictures
+from sb3_saf.networks.encoders import has_pictures
 from sb3_saf.teams.checks import import_by_name
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import OBS_KEY
@@ -82,13 +81,11 @@ def wrap_game(game: Any, wrapping: Mapping[str, Any]) -> Any:
     if "frame_stack" in wrapping:
         import supersuit
 
-        if not all(isinstance(game.observation_space(agent), spaces.Box) for agent in game.possible_agents):
-            game = EqualSpaces(game)  # gives masks in infos, beside vectors that can be stacked
-            space = game.observation_space(game.possible_agents[0])
-            if isinstance(space, PartsSpace):
+        for agent in game.possible_agents:
+            if not isinstance(space := game.observation_space(agent), spaces.Box):
                 raise ValueError(
-                    "frame_stack would mix pictures, or wide integers, with the other parts of these observations: "
-                    "stack them in an env_wrapper of your own, or use policy_kwargs {memory: gru} instead"
+                    f"frame_stack expects observations that are Boxes, {agent} has {space}; use policy_kwargs "
+                    "{memory: gru} instead, or stack them in an env_wrapper of your own"
                 )
         game = supersuit.frame_stack_v1(game, wrapping["frame_stack"])
     return game

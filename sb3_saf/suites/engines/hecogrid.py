@@ -88,7 +88,6 @@ def vec_env(
     state: bool = False,
     render_mode: RenderMode | None = None,
     stagger: bool = False,
-    n_threads: int = 1,
     **params: Any,
 ) -> ResumableBatchVecEnv:
     """
@@ -96,11 +95,10 @@ def vec_env(
 
     :param task: a name of ``hecogrid_envs.TASK_NAMES``
     :param state: must be False: the engine gives views only
-    :param n_threads: threads of the engine; results do not depend on it
     :param params: fields of :class:`hecogrid_envs.HECOGridParams`
     :raises ValueError: for an unknown parameter or a value out of range, or if a state is requested
     """
     if state:
         raise ValueError(f"state=True needs backend='supersuit' for {task}: its engine gives views only")
-    batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs, n_threads)
+    batch = GameBatch(task, HECOGridParams.from_kwargs(params), n_envs)
     return ResumableBatchVecEnv(HECOGridGames(batch, render_mode), seed, render_mode, stagger)
