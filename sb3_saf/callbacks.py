@@ -199,34 +199,9 @@ class TeamEvalCallback(EvalCallback):
     :raises ValueError: if ``eval_env`` has no teams, or its games are those of training
     """
 
-    def __init__(
-        self,
-        eval_env: VecEnv,
-        callback_on_new_best: BaseCallback | None = None,
-        callback_after_eval: BaseCallback | None = None,
-        n_eval_episodes: int = 5,
-        eval_freq: int = 10_000,
-        log_path: str | None = None,
-        best_model_save_path: str | None = None,
-        deterministic: bool = True,
-        render: bool = False,
-        verbose: int = 1,
-        warn: bool = True,
-    ) -> None:
+    def __init__(self, eval_env: VecEnv, *args: Any, **kwargs: Any) -> None:
         require_n_agents(eval_env)
-        super().__init__(
-            eval_env,
-            callback_on_new_best=callback_on_new_best,
-            callback_after_eval=callback_after_eval,
-            n_eval_episodes=n_eval_episodes,
-            eval_freq=eval_freq,
-            log_path=log_path,
-            best_model_save_path=best_model_save_path,
-            deterministic=deterministic,
-            render=render,
-            verbose=verbose,
-            warn=warn,
-        )
+        super().__init__(eval_env, *args, **kwargs)
         self.evaluations_game_steps: list[int] = []
         self.evaluations_agent_results: list[list[list[float]]] = []
         self._next_evaluation = 0
