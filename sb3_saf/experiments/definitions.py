@@ -165,14 +165,9 @@ class Experiment(NamedTuple):
 
     name: str
     question: str
-    envs: tuple[str, ...] = ()
-    methods: tuple[str, ...] = ()
-    views: tuple[View, ...] = ()
-
-    @property
-    def is_grid(self) -> bool:
-        """Whether the experiment has cells to train."""
-        return bool(self.views)
+    envs: tuple[str, ...]
+    methods: tuple[str, ...]
+    views: tuple[View, ...]
 
     @property
     def vary(self) -> dict[str, list[Any]]:
@@ -280,7 +275,6 @@ _ALL: Final = (
     Experiment(
         "qplex", "does a pool help value factorisation?", _THREE_TASKS, ("qplex", "qplex-pool"), (_FIVE_AGENTS,)
     ),
-    Experiment("parameters", "the parameter table"),
 )
 EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for experiment in _ALL}
 
