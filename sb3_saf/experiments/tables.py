@@ -233,7 +233,7 @@ def write_tables(experiment: Experiment, results: Results) -> Frames:
 
 def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     """
-    Write teams for others to play, see ``training/folders.py``: of each task, level and method of a folder of
+    Write teams for others to play (``docs/zoo.md``, "Trained teams"): of each task, level and method of a folder of
     experiments the seed with the best test at the level of its training.
 
     :param target: folder of all teams; a team of the same name is replaced

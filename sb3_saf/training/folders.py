@@ -1,25 +1,6 @@
 """
-Folder of a run, of ``sb3_saf.train`` and of the cells of experiments: one writer, one reader, one list of its files.
-
-    run.json         settings, seed, options, command, versions; written first
-    monitor.csv      one line per team episode
-    NAME.zip         the model; best_model.zip, rl_model_STEPS_steps.zip, evaluations.npz beside it
-    checkpoints/     until the run is finished
-    curve.csv        learning curve: means over the training episodes
-    finished.json    cost, and the digests of the files; written last
-
-``sb3_saf.train`` numbers its runs as RL-Zoo3 does, ``FOLDER/ALGO/NAME_NUMBER`` (NAME is the environment's name in file
-names), and RL-Zoo3's plots can read them.
-
-A published team is such a folder with plain data only, which anybody can play:
-
-    trained_teams/TeamSupport-c2-h1/saf/
-        run.json             settings, seed, versions; ``row``: the row of its table, with the return of each test game
-        weights.safetensors  the best policy by the evaluations
-        replay.html          one episode, if the game is drawn from its state and the page is small
-        finished.json        cost, and the digests of these files
-
-``python -m sb3_saf.experiments publish`` writes them, ``python -m sb3_saf.experiments teams`` checks them.
+Folders of runs and of published teams (``docs/zoo.md``, "Output of a run" and "Trained teams"): one writer, one reader,
+one list of their files.
 """
 
 from __future__ import annotations
