@@ -159,23 +159,20 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
     return figure
 
 
-def calibration(
-    values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration, unit: str | None, n_bins: int = 10
-) -> Figure:
+def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration, unit: str | None) -> Figure:
     """
-    Draw values against returns, and mean returns of bins of equal counts by value.
+    Draw values against returns, and mean returns of tenths by value.
 
     :param values: (n,)
     :param returns: (n,)
     :param unit: unit of returns
-    :param n_bins: at most
     """
     figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
     axes.scatter(values[few], returns[few], s=6, alpha=0.25, color=_GREY, linewidths=0, label="single steps")
     ends = [float(min(values.min(), returns.min())), float(max(values.max(), returns.max()))]
     axes.plot(ends, ends, color="black", linestyle="--", linewidth=1, label="value = return")
-    bins = np.array_split(np.argsort(values, kind="stable"), min(n_bins, len(values)))
+    bins = np.array_split(np.argsort(values, kind="stable"), min(10, len(values)))
     axes.errorbar(
         [float(values[rows].mean()) for rows in bins],
         [float(returns[rows].mean()) for rows in bins],

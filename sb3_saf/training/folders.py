@@ -346,7 +346,7 @@ def find_model(
     Find a trained model.
 
     :param number: number of the run; 0 for the latest
-    :param which: None for the final model, "best", "last" for the last saved one, or the game steps of a saved one
+    :param which: None for the final model, "best", or the game steps of a saved one
     :return: the run, and the model's file
     :raises ValueError: if there is none, with a fix
     """
@@ -360,17 +360,11 @@ def find_model(
     if number and number not in runs:
         raise ValueError(f"there is no run {number} of {environment.id} in {log_folder / algo}; there are {[*runs]}")
     folder = runs[number or max(runs)]
-    if which == "last":
-        saved = [(int(match[1]), path) for path in folder.iterdir() if (match := SAVED_MODEL.fullmatch(path.name))]
-        path = max(saved)[1] if saved else None
-    elif which == "best":
-        path = folder / "best_model.zip"
-    else:
-        path = folder / (f"{name}.zip" if which is None else f"rl_model_{which}_steps.zip")
-    if path is None or not path.is_file():
+    names: dict[object, str] = {None: f"{name}.zip", "best": "best_model.zip"}
+    path = folder / names.get(which, f"rl_model_{which}_steps.zip")
+    if not path.is_file():
         raise ValueError(
-            f"{folder} has no {'saved model' if path is None else path.name}; --save-freq and --eval-freq of "
-            "sb3_saf.train save models on the way"
+            f"{folder} has no {path.name}; --save-freq and --eval-freq of sb3_saf.train save models on the way"
         )
     return Run(folder), path
 
