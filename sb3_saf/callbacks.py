@@ -208,7 +208,6 @@ class TeamEvalCallback(EvalCallback):
         self._is_done_for_rollout = False
         #: Seconds of the evaluations of this training.
         self.seconds = 0.0
-        self._started = 0.0
 
     def _init_callback(self) -> None:
         require_n_agents(self.training_env)
@@ -219,18 +218,12 @@ class TeamEvalCallback(EvalCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._started, self.seconds = time.monotonic(), 0.0
+        self.seconds = 0.0
         self._plan_next()
 
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
         self._is_done_for_rollout = False
-
-    def _on_training_end(self) -> None:
-        super()._on_training_end()
-        if self.seconds:
-            share = self.seconds / (time.monotonic() - self._started)
-            self._say(f"Evaluation took {100 * share:.0f} % of the time")
 
     def _plan_next(self) -> None:
         """Set the next multiple of ``eval_freq``, which steps of E games at a time may skip."""
