@@ -249,7 +249,6 @@ def test_returns_have_the_scale_of_values_that_were_learned_with_normalize(tmp_p
     ("given", "message"),
     [
         (["--model", "nowhere.zip"], "--model nowhere.zip is not there"),
-        (["--model", "nowhere.zip", "--env", "Nothing-v0"], "--model nowhere.zip is not there"),
         (["--model", __file__, "--size", "huge"], "unknown size 'huge'"),
         (["--model", __file__], "does not hold the tensors of a saved model"),
     ],
