@@ -61,7 +61,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
     import_packages(options.gym_packages)
     with user_errors(ValueError, OSError, ExportError):
         seed = evaluation_seed(check_seed(options.seed))
-        paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in options.model]
+        models = list(dict.fromkeys(options.model))
+        paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
         settings = [_settings_of(path, options) for path in paths]
         suite = settings[0].environment.suite
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
@@ -70,7 +71,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         ) as games:
             players: dict[str, Any] = {
                 name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
-                for name, path, own in zip(_names(options.model), paths, settings, strict=True)
+                for name, path, own in zip(_names(models), paths, settings, strict=True)
             }
             if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
                 raise ValueError("a model with normalize is shown alone: its games are normalised with its statistics")
@@ -97,13 +98,9 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return distinct names of models: file names, with folders and numbers if necessary."""
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{path.parent.name}/{path.stem}" for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{number}: {name}" for number, name in enumerate(names, 1)]
-    return names
+    """Return distinct names of models: file names, or paths where these are equal."""
+    stems = [path.stem for path in paths]
+    return [stem if stems.count(stem) == 1 else str(path) for path, stem in zip(paths, stems, strict=True)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
