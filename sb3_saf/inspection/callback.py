@@ -26,12 +26,10 @@ from sb3_saf.inspection.recording import (
     EpisodeRecording,
     Picture,
     ReturnScale,
-    Zones,
     record_episodes,
     require_our_policy,
     return_scale,
     zone_colours,
-    zone_function,
 )
 from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
@@ -117,7 +115,6 @@ def inspect_team(
     n_eval_episodes: int = 16,
     seed: int = 20_000,
     deterministic: bool = False,
-    zones: Zones = None,
     *,
     pictures: bool = True,
     observations: bool = True,
@@ -134,7 +131,6 @@ def inspect_team(
     :param n_eval_episodes: team episodes to play
     :param seed: seed of the episodes
     :param deterministic: whether the policy takes its most likely actions
-    :param zones: as in :class:`~sb3_saf.InspectionCallback`
     :param pictures: whether to draw the first game
     :param observations: whether to record the agents' own observations
     :raises ValueError: if the policy is not of this package or ``eval_env`` has no teams
@@ -146,7 +142,6 @@ def inspect_team(
         seed,
         deterministic,
         gamma=float(getattr(model, "gamma", 1.0)),
-        zones=zones,
         normalizer=model.get_vec_normalize_env(),
         observations=observations,
         pictures=pictures,
@@ -174,8 +169,6 @@ class InspectionCallback(BaseCallback):
     :param seed: seed of the episodes, which are the same at every inspection
     :param deterministic: whether the policy takes its most likely actions, as QPLEX always does; others sample in
         training
-    :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) integers from 0; None uses the
-        games' ``agent_zones``, as in HECOGrid; False for no zones
     :param pictures: whether to draw figures and episodes, which needs matplotlib and Pillow; False writes numbers only
     :param hparams: additional hyperparameters to show, such as the task and its level
     :param verbose: 1 prints a line per inspection
@@ -192,7 +185,6 @@ class InspectionCallback(BaseCallback):
         n_eval_episodes: int = 16,
         seed: int = 20_000,
         deterministic: bool = False,
-        zones: Zones = None,
         pictures: bool = True,
         hparams: Mapping[str, object] | None = None,
         verbose: int = 0,
@@ -203,7 +195,6 @@ class InspectionCallback(BaseCallback):
         check_count("n_eval_episodes", n_eval_episodes)
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-        zone_function(eval_env, zones)  # refuses what is no function
         if pictures:
             try:
                 import matplotlib  # noqa: F401
@@ -217,7 +208,6 @@ class InspectionCallback(BaseCallback):
         self.pictures = pictures
         self.hparams = dict(hparams or {})
         self.n_eval_episodes, self.seed, self.deterministic = n_eval_episodes, int(seed), deterministic
-        self.zones = zones
         #: Seconds spent so far.
         self.seconds = 0.0
         self._next = 0
@@ -271,7 +261,6 @@ class InspectionCallback(BaseCallback):
             self.n_eval_episodes,
             self.seed,
             self.deterministic,
-            self.zones,
             pictures=self.pictures,
             observations=False,
         )
