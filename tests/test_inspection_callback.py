@@ -125,8 +125,8 @@ class TestInHand:
         assert {tag: pytest.approx(written[shown_as[tag]][-1], rel=1e-5) for tag in look.scalars} == look.scalars
         assert shown_as["pool/chosen/policy_2"] == Line("pool/chosen", "policy_2")
         assert shown_as["message/value_error"] == Line("message/value_error", "message_as_read")
-        assert {*look.figures, "episode/strip", "episode/film"} == set(found.Tags()["images"])
-        assert look.film is not None and look.strip is not None
+        assert {*look.figures, "episode/film"} == set(found.Tags()["images"])
+        assert look.film is not None
         shown = found.Images("episode/film")[-1].encoded_image_string
         np.testing.assert_array_equal(
             np.asarray(Image.open(io.BytesIO(look.film))), np.asarray(Image.open(io.BytesIO(shown)))
@@ -162,7 +162,7 @@ class TestPage:
         assert set(page.Tags()["images"]) == {
             *("pool/by_zone", "pool/by_agent", "pool/differences"),
             *("knowledge_source/attention", "knowledge_source/one_episode"),
-            *("critic/calibration", "episode/strip", "episode/film"),
+            *("critic/calibration", "episode/film"),
         }
         for tag in page.Tags()["images"]:
             image = Image.open(io.BytesIO(page.Images(tag)[-1].encoded_image_string))

@@ -24,7 +24,6 @@ from sb3_saf.inspection import figures
 from sb3_saf.inspection import scalars as numbers
 from sb3_saf.inspection.recording import (
     EpisodeRecording,
-    Picture,
     ReturnScale,
     record_episodes,
     require_our_policy,
@@ -103,11 +102,6 @@ class Inspection(NamedTuple):
         """The first episode as a GIF; None if the environment draws no pictures. Needs Pillow."""
         return figures.gif(self.recording.pictures) if self.recording.pictures else None
 
-    @property
-    def strip(self) -> Picture | None:
-        """Six moments of the first episode, (height, width, 3); None if the environment draws no pictures."""
-        return figures.strip(self.recording.pictures) if self.recording.pictures else None
-
 
 def inspect_team(
     model: BaseAlgorithm,
@@ -156,7 +150,7 @@ class InspectionCallback(BaseCallback):
 
     Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes. The run's
     TensorBoard file gets team returns; the pool's selection by zone and by agent; attention and messages of the
-    knowledge source; the critic's calibration, with and without messages; an episode as pictures; hyperparameters; a
+    knowledge source; the critic's calibration, with and without messages; an episode as a film; hyperparameters; a
     text that explains the tags; and a layout of the custom scalars page. ``docs/tensorboard.md`` explains the results.
     Parts that a policy or an environment lacks are omitted.
 
@@ -272,9 +266,7 @@ class InspectionCallback(BaseCallback):
                 self._page.show("rollout/team_return_of_each_episode", recent)
             for tag, figure in inspection.figures.items():
                 self._page.show(tag, logger.Figure(figure, close=True))
-            strip, film = inspection.strip, inspection.film
-            if strip is not None and film is not None:
-                self._page.show("episode/strip", logger.Image(strip, "HWC"))
+            if (film := inspection.film) is not None:
                 self._page.gif("episode/film", film, team_steps(self.model))
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began

@@ -1,5 +1,5 @@
 """
-Figures of the TensorBoard page, and an episode as pictures: a few moments in two rows, and a GIF.
+Figures of the TensorBoard page, and an episode as a GIF.
 
 Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones have the environment's colours. Letters:
 U policies, K zones, N agents, L slots, T game steps, n values.
@@ -200,27 +200,9 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Ca
 
 # --- pictures of an episode -------------------------------------------------------------------------------------------
 
-#: Height in pixels of a moment in the strip of six moments, three to a row, and of the GIF.
+#: Largest height in pixels of the GIF.
 _HEIGHT: Final = 320
-_GAP: Final = 6
-_N_MOMENTS: Final = 6
-_PER_ROW: Final = 3
 _COLOURS: Final = 64
-
-
-def strip(pictures: Sequence[Picture]) -> Picture:
-    """Join six evenly spaced pictures (height, width, 3) in two rows, or all in one row if there are fewer."""
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, _N_MOMENTS).round().astype(int))
-    moments = [_scaled(pictures[index]) for index in chosen]
-    rows = [moments] if len(moments) < _N_MOMENTS else [moments[:_PER_ROW], moments[_PER_ROW:]]
-    return _joined([_joined(row, axis=1) for row in rows], axis=0)
-
-
-def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
-    """Join pictures with white gaps."""
-    height, width, _ = pictures[0].shape
-    gap = np.full((height, _GAP, 3) if axis == 1 else (_GAP, width, 3), 255, dtype=np.uint8)
-    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
 
 
 def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:
