@@ -10,7 +10,6 @@ from typing import Any, Final
 
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_saf.export.act import Actor
 from sb3_saf.inspection.replay import replay
 from sb3_saf.teams.checks import ExportError, check_seed, evaluation_seed
 from sb3_saf.training.commands import (
@@ -42,7 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="+",
         required=True,
         metavar="FILE",
-        help="a model (.zip), or the folder of a published team or of exported actors; several are shown side by side",
+        help="a model (.zip), or the folder of a published team; several are shown side by side",
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("replay.html"), help="the page")
     add_environment_options(parser, "another level than was trained on, such as coordination:3")
@@ -70,7 +69,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
         ) as games:
             players: dict[str, Any] = {
-                name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
+                name: make_policy(own, path, games)
                 for name, path, own in zip(_names(models), paths, settings, strict=True)
             }
             if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
