@@ -10,13 +10,10 @@ The others have settings as close to these as they allow: views of 7 x 7 cells, 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +21,7 @@ import numpy as np
 
 import sb3_saf
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, parallel_env
+from sb3_saf.training.folders import software_versions
 
 #: Does some work and returns the number of agent-steps.
 Work = Callable[[], int]
@@ -268,16 +266,6 @@ def table(rates: dict[str, list[float]]) -> str:
     return "\n".join(lines)
 
 
-def machine() -> str:
-    """Describe processor and versions."""
-    processor = platform.processor() or "unknown processor"
-    with contextlib.suppress(OSError):
-        models = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
-        processor = models[0].partition(":")[2].strip() if models else processor
-    versions = ", ".join(f"{name} {version(name)}" for name in ("numba", "numpy", "torch", "stable-baselines3"))
-    return f"Python {platform.python_version()}, {versions}; {processor}, {platform.system()}"
-
-
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -289,7 +277,9 @@ def main() -> None:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     text = table(measure(programs(), options.seconds, options.rounds))
     print(text)
-    head = f"`python -m benchmarks.environments`: medians of {options.rounds} rounds on one core. {machine()}."
+    versions = software_versions()
+    machine = ", ".join(f"{name} {versions[name]}" for name in ("processor", "python", "numba", "numpy", "torch"))
+    head = f"`python -m benchmarks.environments`: medians of {options.rounds} rounds on one core; {machine}."
     options.output.write_text(f"# Speed of the games\n\n{head}\n\n{text}\n", encoding="utf-8")
 
 

@@ -184,21 +184,12 @@ def recurrent_models(units: int) -> dict[str, OnPolicyAlgorithm]:
 
 def small_model(algo: str, n_agents: int | None = None, n_games: int | None = None) -> PPO:
     """Create PPO of the zoo's size ``small``; for any number of agents, with equal rows and density."""
-    overrides = {} if n_games is None else {"n_envs": n_games}
-    settings = load_settings(algo, "TeamSupport-v0", "small", overrides=overrides)
-    if n_agents is None:
-        model = settings.make_model(settings.make_env(0), 0, device="cpu")
-        assert isinstance(model, PPO)
-        return model
-    n_games = max(1, GROWTH_ROWS // n_agents)
-    side = max(8, round(15 * (n_agents / 5) ** 0.5))
-    settings = load_settings(
-        algo,
-        "TeamSupport-v0",
-        "small",
-        overrides={"n_envs": n_games, "n_steps": 50, "n_minibatches": 2},
-        env_kwargs={"n_agents": n_agents, "grid_size": side, "n_treasures": side * side // 9},
-    )
+    overrides, env_kwargs = {} if n_games is None else {"n_envs": n_games}, {}
+    if n_agents is not None:
+        side = max(8, round(15 * (n_agents / 5) ** 0.5))
+        overrides = {"n_envs": max(1, GROWTH_ROWS // n_agents), "n_steps": 50, "n_minibatches": 2}
+        env_kwargs = {"n_agents": n_agents, "grid_size": side, "n_treasures": side * side // 9}
+    settings = load_settings(algo, "TeamSupport-v0", "small", env_kwargs, overrides)
     model = settings.make_model(settings.make_env(0), 0, device="cpu")
     assert isinstance(model, PPO)
     return model

@@ -32,7 +32,10 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FILE: Final = Path("results", "suites_baselines.csv")
 COLUMNS: Final = ("task", "program", "seed", "game_steps", "return", "won", "processor_seconds", "source")
@@ -319,7 +322,7 @@ def print_trainings(clones: Mapping[str, Path | None], interpreters: Mapping[str
 
     Ours are tested on 32 games with drawn actions; the time until a return is that of the training episodes.
     """
-    suite_results, times = import_module("benchmarks.suite_results"), import_module("benchmarks.time_to_return")
+    suite_results = import_module("benchmarks.suite_results")
     print("\n| task | program | game steps | return | processor s | until the first one's return |")
     print("|" + " --- |" * 6)
     for peer in RATED:
@@ -334,11 +337,18 @@ def print_trainings(clones: Mapping[str, Path | None], interpreters: Mapping[str
             results = suite_results.read_results(Path(folder, task.name), task.name)
         for method, tests in results.tests[results.tests["method"] != "random"].groupby("method"):
             curve = results.curves[results.curves["method"] == method]
-            until = times.reached(curve, float(row[4]))[0] if row else math.nan
+            until = _seconds_until(curve, float(row[4])) if row else math.nan
             test = tests.iloc[0]
             _print_row(
                 peer.task, method.upper(), test["game_steps"], test["return_mean"], test["processor_seconds"], until
             )
+
+
+def _seconds_until(curve: pd.DataFrame, value: float) -> float:
+    """Return the processor seconds after which the mean of five points of a curve first reached a value."""
+    curve = curve.sort_values("game_steps")
+    there = curve["processor_seconds"][curve["score"].rolling(5).mean() >= value]
+    return math.inf if there.empty else float(there.iloc[0])
 
 
 def _print_row(task: str, program: str, game_steps: int, value: float, seconds: float, until: float = math.nan) -> None:

@@ -199,41 +199,15 @@ class TeamEvalCallback(EvalCallback):
     :raises ValueError: if ``eval_env`` has no teams, or its games are those of training
     """
 
-    def __init__(
-        self,
-        eval_env: VecEnv,
-        callback_on_new_best: BaseCallback | None = None,
-        callback_after_eval: BaseCallback | None = None,
-        n_eval_episodes: int = 5,
-        eval_freq: int = 10_000,
-        log_path: str | None = None,
-        best_model_save_path: str | None = None,
-        deterministic: bool = True,
-        render: bool = False,
-        verbose: int = 1,
-        warn: bool = True,
-    ) -> None:
+    def __init__(self, eval_env: VecEnv, *args: Any, **kwargs: Any) -> None:
         require_n_agents(eval_env)
-        super().__init__(
-            eval_env,
-            callback_on_new_best=callback_on_new_best,
-            callback_after_eval=callback_after_eval,
-            n_eval_episodes=n_eval_episodes,
-            eval_freq=eval_freq,
-            log_path=log_path,
-            best_model_save_path=best_model_save_path,
-            deterministic=deterministic,
-            render=render,
-            verbose=verbose,
-            warn=warn,
-        )
+        super().__init__(eval_env, *args, **kwargs)
         self.evaluations_game_steps: list[int] = []
         self.evaluations_agent_results: list[list[list[float]]] = []
         self._next_evaluation = 0
         self._is_done_for_rollout = False
         #: Seconds of the evaluations of this training.
         self.seconds = 0.0
-        self._started = 0.0
 
     def _init_callback(self) -> None:
         require_n_agents(self.training_env)
@@ -244,18 +218,12 @@ class TeamEvalCallback(EvalCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._started, self.seconds = time.monotonic(), 0.0
+        self.seconds = 0.0
         self._plan_next()
 
     def _on_rollout_start(self) -> None:
         super()._on_rollout_start()
         self._is_done_for_rollout = False
-
-    def _on_training_end(self) -> None:
-        super()._on_training_end()
-        if self.seconds:
-            share = self.seconds / (time.monotonic() - self._started)
-            self._say(f"Evaluation took {100 * share:.0f} % of the time")
 
     def _plan_next(self) -> None:
         """Set the next multiple of ``eval_freq``, which steps of E games at a time may skip."""

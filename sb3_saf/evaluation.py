@@ -89,9 +89,9 @@ class EvaluationResult(NamedTuple):
         """(N,) mean return of each agent."""
         return tuple(float(value) for value in np.mean(self.agent_returns, axis=0)) if self.agent_returns else ()
 
-    def interval(self, confidence: float = 0.95) -> Interval:
-        """Return Student's t interval of the mean team return."""
-        return confidence_interval(self.returns, confidence)
+    def interval(self) -> Interval:
+        """Return the 95 % interval (Student's t) of the mean team return."""
+        return confidence_interval(self.returns)
 
     def __str__(self) -> str:
         low, high = self.interval()

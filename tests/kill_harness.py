@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import io
 import json
 import multiprocessing as mp
 import os
@@ -31,7 +30,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -213,29 +211,38 @@ def kill(algo: str, games: Games, folder: Path, rollouts: int, moment: Moment) -
     return watch.phase if process.exitcode == -signal.SIGKILL else None
 
 
-def same(one: Path, other: Path) -> bool:
-    """Whether finished runs are equal: weights, replay buffer, best model, evaluations, episodes except times."""
-    return (
-        all(_same_arrays(one / name, other / name) for name in ("weights.npz", "evaluations.npz"))
-        and _episodes(one) == _episodes(other) != []
-        and _best(one) == _best(other) != {}
-    )
+#: Files that are written last.
+_LAST: Final = ("weights.npz", "finished.json")
 
 
-def _best(folder: Path) -> dict[str, bytes]:
-    with zipfile.ZipFile(folder / "best_model.zip") as file:
-        weights = th.load(io.BytesIO(file.read("policy.pth")), weights_only=True)
-    return {name: tensor.numpy().tobytes() for name, tensor in weights.items()}
+def results_of(folder: Path) -> dict[str, Any]:
+    """
+    Return what all finished runs in a folder left, by file: settings, weights, a script's replay buffer, evaluations,
+    episodes and test returns, without times.
 
-
-def _same_arrays(one: Path, other: Path) -> bool:
-    with np.load(one) as a, np.load(other) as b:
-        return a.files == b.files and all(a[name].tobytes() == b[name].tobytes() for name in a.files)
-
-
-def _episodes(folder: Path) -> list[str]:
-    lines = (folder / "monitor.csv").read_text().splitlines()[1:]
-    return [line.rsplit(",", 1)[0] for line in lines]
+    A command that was killed before its first checkpoint, or after its end, begins another run, in another folder with
+    the next number. Numbers are left out of the names, so that all of these runs must be equal.
+    """
+    results: dict[str, Any] = {}
+    for path in sorted(folder.rglob("[!.]*")):  # without what a kill left half-written
+        content: Any = None
+        if path.suffix == ".zip":
+            content = {key: value.numpy().tobytes() for key, value in read_weights(path).items()}
+        elif path.suffix == ".npz":
+            with np.load(path) as arrays:
+                content = {key: arrays[key].tobytes() for key in arrays.files}
+        elif path.name == "monitor.csv":
+            content = [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()[1:]]
+        elif path.name == "run.json":
+            content = json.loads(path.read_text())["settings"]
+        elif path.parent.name == "tests":
+            content = json.loads(path.read_text())
+            for play in content["plays"]:
+                del play["wall_seconds"]
+        if content is not None and any((parent / name).exists() for parent in path.parents for name in _LAST):
+            name = re.sub(r"_\d+(?=/)", "", str(path.relative_to(folder)))
+            results[name] = content if results.get(name, content) == content else "runs differ"
+    return results
 
 
 # --- many kills -------------------------------------------------------------------------------------------------------
@@ -252,7 +259,7 @@ def kill_in_a_row(algo: str, games: Games, rollouts: int, moments: Sequence[Mome
         finish(algo, games, folder / "undisturbed", rollouts)
         doing = [kill(algo, games, folder / "killed", rollouts, moment) for moment in moments]
         finish(algo, games, folder / "killed", rollouts)
-        return doing, same(folder / "undisturbed", folder / "killed")
+        return doing, results_of(folder / "undisturbed") == results_of(folder / "killed") != {}
 
 
 def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: int) -> tuple[Counter[str], Counter[str]]:
@@ -275,7 +282,7 @@ def kill_one_by_one(algo: str, games: Games, rollouts: int, kills: int, seed: in
             doing = kill(algo, games, folder / "killed", rollouts, Moment(kind, when))
             newest = sorted(folder.glob("killed/checkpoints/checkpoint-*"))[-1:]
             finish(algo, games, folder / "killed", rollouts)
-            is_equal = same(folder / "undisturbed", folder / "killed")
+            is_equal = results_of(folder / "undisturbed") == results_of(folder / "killed") != {}
             if doing is not None:
                 done[kind] += 1
                 equal[kind] += is_equal
@@ -321,7 +328,7 @@ def kill_command(name: str, kills: int, seed: int) -> tuple[int, int]:
         if process.wait():
             raise RuntimeError(f"{name} failed with exit code {process.returncode}")
         print(f"{name}, undisturbed: {begun - began:.1f} s until it writes, {time.monotonic() - begun:.1f} s after it")
-        seconds, result = time.monotonic() - begun, _results(whole)
+        seconds, result = time.monotonic() - begun, results_of(whole)
         if not result:
             raise RuntimeError(f"{name} left no finished run in {whole}")
         while done < kills:
@@ -338,7 +345,7 @@ def kill_command(name: str, kills: int, seed: int) -> tuple[int, int]:
                     raise RuntimeError(
                         f"{name} failed with exit code {process.returncode} after a kill at {when:.2f} s"
                     )
-                is_equal = _results(folder) == result
+                is_equal = results_of(folder) == result
                 equal += is_equal
                 print(f"{name} killed after {when:.2f} s: {'bit-equal' if is_equal else 'DIFFERENT'}", flush=True)
             rmtree(folder)
@@ -366,33 +373,6 @@ def _wait_for_children(session: int, seconds: float = 30) -> None:
         if time.monotonic() > ends:
             raise RuntimeError(f"processes of session {session} are left {seconds:g} s after it was killed")
         time.sleep(0.1)
-
-
-def _results(folder: Path) -> dict[str, Any]:
-    """
-    Return weights, evaluations, episodes and test returns of all finished runs in a folder, by file.
-
-    A command that was killed before its first checkpoint, or after its end, begins another run, in another folder with
-    the next number. Numbers are left out of the names, so that all of these runs must be equal.
-    """
-    results: dict[str, Any] = {}
-    for path in sorted(folder.rglob("*")):
-        content: Any = None
-        if path.suffix == ".zip":
-            content = {key: value.numpy().tobytes() for key, value in read_weights(path).items()}
-        elif path.name == "evaluations.npz":
-            with np.load(path) as arrays:
-                content = {key: arrays[key].tobytes() for key in arrays.files}
-        elif path.name == "monitor.csv":
-            content = _episodes(path.parent)
-        elif path.parent.name == "tests":
-            content = json.loads(path.read_text())
-            for play in content["plays"]:
-                del play["wall_seconds"]
-        if content is not None and any((parent / "finished.json").exists() for parent in path.parents):
-            name = re.sub(r"_\d+(?=/)", "", str(path.relative_to(folder)))
-            results[name] = content if results.get(name, content) == content else "runs differ"
-    return results
 
 
 def main() -> None:

@@ -14,7 +14,6 @@ from sb3_saf.experiments.definitions import (
     EXPERIMENTS,
     RANDOM,
     Cell,
-    Grid,
     Level,
     RunConfig,
     Selection,
@@ -37,12 +36,12 @@ def at(coordination: int, heterogeneity: int) -> Level:
     return Level.of(coordination=coordination, heterogeneity=heterogeneity)
 
 
-def grid_of(name: str, config: RunConfig = PAPER, selection: Selection = THREE_SEEDS) -> Grid:
+def grid_of(name: str, config: RunConfig = PAPER, selection: Selection = THREE_SEEDS) -> list[Cell]:
     return expand(find_experiment(name), selection, config)
 
 
-def trained(grid: Grid) -> list[Cell]:
-    return [cell for cell in grid.cells if cell.is_trained]
+def trained(cells: list[Cell]) -> list[Cell]:
+    return [cell for cell in cells if cell.is_trained]
 
 
 #: Methods x tasks x levels x three seeds, and the levels of the random team.
@@ -59,16 +58,15 @@ SIZES = {
 
 
 def test_every_row_of_the_paper_has_a_name() -> None:
-    assert list(EXPERIMENTS) == [*SIZES, "parameters"]
+    assert list(EXPERIMENTS) == list(SIZES)
 
 
 @pytest.mark.parametrize(("name", "n_trained", "n_random"), [(name, *counts) for name, counts in SIZES.items()])
 def test_number_of_cells(name: str, n_trained: int, n_random: int) -> None:
-    grid = grid_of(name)
-    assert len(trained(grid)) == n_trained
-    assert len(grid.cells) - n_trained == n_random
-    assert len({cell.id for cell in grid.cells}) == len(grid.cells)
-    assert grid.left_out == []
+    cells = grid_of(name)
+    assert len(trained(cells)) == n_trained
+    assert len(cells) - n_trained == n_random
+    assert len({cell.id for cell in cells}) == len(cells)
 
 
 def test_levels_of_the_paper() -> None:
@@ -97,43 +95,34 @@ def test_paper_size_is_the_papers() -> None:
         assert settings.n_agents == 10
         assert {name: settings.env_kwargs[name] for name in cell.level.env_kwargs} == cell.level.env_kwargs
     assert (PAPER.episodes, PAPER.eval_freq, PAPER.eval_episodes) == (512, None, 32)
-    (cell, *_) = grid_of("qplex").cells
+    (cell, *_) = grid_of("qplex")
     assert PAPER.settings(cell).n_agents == 5
     assert cell.id == "TeamTogether-c1-h1-n5/qplex/seed-0"
 
 
-def test_levels_that_do_not_fit_are_named_with_the_reason() -> None:
-    grid = grid_of("coordination", replace(PAPER, overrides={"env_kwargs": {"n_agents": 2}}))
-    assert {cell.level for cell in grid.cells} == {at(1, 1), at(2, 1)}
-    assert [(left.task, left.test) for left in grid.left_out] == [
-        (env.removesuffix("-v0"), at(3, 1)) for env in find_experiment("coordination").envs
-    ]
-    assert str(grid.left_out[0]) == (
-        "TeamTogether: training at c=3, h=1 is left out: coordination must be an integer from 1 to 2 "
-        "(1 <= coordination <= n_agents), got 3"
-    )
-    with pytest.raises(ValueError, match=r"no level of joint fits the size 'paper': .*coordination"):
-        grid_of("joint", replace(PAPER, overrides={"env_kwargs": {"n_agents": 1}}))
-
-
-def test_tests_that_do_not_fit_leave_the_training_alone() -> None:
+def test_levels_that_do_not_fit_are_errors() -> None:
+    two = replace(PAPER, overrides={"env_kwargs": {"n_agents": 2}})
+    with pytest.raises(
+        ValueError, match=r"TeamTogether at c=3, h=1 cannot be made in the size 'paper': .*got 3; .*--levels"
+    ):
+        grid_of("coordination", two)
+    cells = grid_of("coordination", two, replace(THREE_SEEDS, levels=("1", "2")))
+    assert {cell.level for cell in cells} == {at(1, 1), at(2, 1)}
     narrow = replace(PAPER, overrides={"env_kwargs": {"grid_size": 6, "n_treasures": 2}})
-    grid = grid_of("ood-heterogeneity", narrow)
-    assert {cell.tests for cell in trained(grid)} == {tuple(at(1, h) for h in (1, 2, 3, 4))}
-    assert {(left.level, left.test) for left in grid.left_out} == {(at(1, 2), at(1, 5))}
-    assert "the test at c=1, h=5 after training at c=1, h=2 is left out" in str(grid.left_out[0])
+    with pytest.raises(ValueError, match="at c=1, h=5 cannot be made"):  # a test
+        grid_of("ood-heterogeneity", narrow)
 
 
 def test_experiments_share_cells() -> None:
-    alone = grid_of("coordination").cells
-    together = merge([*alone, *grid_of("ood-coordination").cells])
+    alone = grid_of("coordination")
+    together = merge([*alone, *grid_of("ood-coordination")])
     assert len(together) == len(alone)
     shared = next(cell for cell in together if cell.id == "TeamSupport-c2-h1/saf/seed-0")
     assert set(shared.tests) == {at(1, 1), at(2, 1), at(3, 1)}
 
 
 def test_shards_are_a_partition_and_have_all_methods() -> None:
-    cells = grid_of("coordination").cells
+    cells = grid_of("coordination")
     for count in (1, 2, 7, 200):
         parts = [Shard(number, count).of(cells) for number in range(1, count + 1)]
         assert sorted(cell.id for part in parts for cell in part) == sorted(cell.id for cell in cells)
@@ -160,10 +149,10 @@ def test_bad_shards(text: str) -> None:
 )
 def test_some_levels_only(name: str, levels: str, trains: set[Level], tests: set[Level]) -> None:
     part = Selection((0,), levels=tuple(levels))
-    cells = grid_of(name, selection=part).cells
+    cells = grid_of(name, selection=part)
     assert {cell.level for cell in cells if cell.is_trained} == trains
     assert {level for cell in cells for level in cell.tests} == tests
-    everything = grid_of(name, selection=Selection((0,))).cells
+    everything = grid_of(name, selection=Selection((0,)))
     assert {cell.id for cell in everything if part.has(cell, find_experiment(name))} == {cell.id for cell in cells}
 
 
@@ -202,13 +191,6 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert "trained at c=2, h=1, tested at c=1, h=1; c=2, h=1; c=3, h=1" in printed
 
 
-@pytest.mark.parametrize("command", ["run", "report"])
-def test_parameters(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    printed = output(capsys, command, "parameters")
-    for number in ("1,233,056", "1,740,016", "2,477,296", "2,556,486"):
-        assert number in printed
-
-
 def test_plan_lists_cells_and_totals(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["plan", "ood-coordination", "--size", "paper", "-f", str(tmp_path / "new")]
     tested = "tested at c=1, h=1; c=2, h=1; c=3, h=1"
@@ -226,22 +208,17 @@ def test_plan_lists_cells_and_totals(capsys: pytest.CaptureFixture[str], tmp_pat
     assert "cells       6 to train" in part and "60,000,000 left of 60,000,000" in part
 
 
-def test_plan_counts_what_is_finished_and_names_what_is_left_out(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    config = RunConfig("smoke", {"env_kwargs": {"n_agents": 3}}, 16, 200, 2)
-    run(find_experiment("joint"), Selection((0,), ("ippo",)), config, Results(tmp_path), InlineEngine())
+def test_plan_counts_what_is_finished(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    config = RunConfig("smoke", {}, 16, 200, 2)
+    run(find_experiment("joint"), Selection((0,), ("ippo",), (), ("2", "3")), config, Results(tmp_path), InlineEngine())
     capsys.readouterr()
-    words = ["plan", "joint", "-f", str(tmp_path), "--env-kwargs", "n_agents:3", "--methods", "ippo", "--seeds", "0"]
+    words = ["plan", "joint", "-f", str(tmp_path), "--levels", "2", "3", "--methods", "ippo", "--seeds", "0"]
     printed = output(capsys, *words, "1")
     assert "cells       4 to train (1 methods x 2 settings x 2 seeds), 2 of them finished" in printed
     assert "game steps  800 left of 1,600 (400 a cell)" in printed
     assert re.search(
         r"rate +[\d,]+ game steps/s of one worker in the finished cells\ntime +about 0:\d\d:\d\d \(h:mm:ss\) of one",
         printed,
-    )
-    assert (
-        "left out    TeamSupport: training at c=4, h=4 is left out: coordination must be an integer from 1" in printed
     )
     assert "game steps  0 left of 800" in output(capsys, *words)
 

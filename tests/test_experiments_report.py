@@ -272,11 +272,11 @@ def test_aggregates_compare_like_with_like() -> None:
 
 def test_results_stand_beside_what_is_known_of_the_same_games(tmp_path: Path) -> None:
     experiment, results = find_experiment("coordination"), Results(tmp_path)
-    config, cells = RunConfig("small"), expand(experiment, Selection((0,), ("saf",)), RunConfig("small")).cells
+    config, cells = RunConfig("small"), expand(experiment, Selection((0,), ("saf",)), RunConfig("small"))
     rows = [("TeamSupport", "saf", "c2-h1", "c2-h1", math.nan, 17.0, 200_000)]
     names = ["task", "method", "train_level", "level", "success_rate", "return_mean", "game_steps"]
     frames = Frames(pd.DataFrame(rows, columns=names), pd.DataFrame())
-    text = known(Content(experiment, config, results, cells, [], [], frames, []))
+    text = known(Content(experiment, config, results, cells, [], frames, []))
     line = "TeamSupport, c=2, h=1, SAF: return, sum over agents: 17; random 1.38; script that sees 7 x 7 tiles 17.03"
     assert [part[2:] for part in text.splitlines()[2:]] == [line]
 

@@ -402,26 +402,36 @@ def test_confident_choices_of_flags_are_exported(tmp_path: Path) -> None:
 # --- programs with nothing but the files ------------------------------------------------------------------------------
 
 
+#: A program beside ``act.py``; its arguments are the agent, modules to hide, and a file of observations and masks.
+BESIDE = """
+import json, sys
+sys.modules.update(dict.fromkeys(sys.argv[2].split()))
+import numpy as np
+from act import Actor
+
+actor, given = Actor.load(".", agent=int(sys.argv[1])), np.load(sys.argv[3])
+memory = actor.new_memory() if actor.has_memory else None
+masks = given["masks"] if "masks" in given else [None] * len(given["obs"])
+actions = [actor.act(own, action_mask=mask, memory=memory) for own, mask in zip(given["obs"], masks)]
+print(json.dumps(np.stack(actions).tolist()))
+"""
+
+
 @pytest.mark.parametrize("name", ["heads, grey pictures", "heads with memory", "masked rows"])
-def test_the_script_acts_as_the_model_without_other_packages(
+def test_the_file_acts_as_the_model_without_other_packages(
     name: str, exports: Callable[[str], Exported], tmp_path: Path
 ) -> None:
     policy, folder, actor = exports(name)
-    obs, masks = samples(policy.team_spaces.own, 7), random_masks(spaces.Discrete(3), 7, np.random.default_rng(0))
-    np.save(tmp_path / "obs.npy", obs)
-    np.save(tmp_path / "masks.npy", masks)
-    options = ["--action-mask", str(tmp_path / "masks.npy")] if "mask" in name else []
-    words = ["act.py", str(tmp_path / "obs.npy"), "--agent", str(AGENT), *options]
-    hidden = (*ABSENT, "sb3_saf", "hecogrid_envs", "safetensors", "msgspec")
-    code = f"import sys, runpy; sys.modules.update(dict.fromkeys({hidden})); sys.argv = {words}; "
-    code += f"runpy.run_path({str(folder / 'act.py')!r}, run_name='__main__')"
-    command = [sys.executable, "-c", code]
-    answer = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
-    if actor.has_memory:  # the steps of one episode
-        memory = actor.new_memory()
-        expected = np.stack([actor.act(one, memory=memory) for one in obs])
-    else:
-        expected = actor.act(obs, action_mask=masks if options else None)
+    given = {"obs": samples(policy.team_spaces.own, 7)}
+    if "mask" in name:
+        given["masks"] = random_masks(spaces.Discrete(3), 7, np.random.default_rng(0))
+    np.savez(tmp_path / "given.npz", **given)  # type: ignore[arg-type]
+    hidden = " ".join((*ABSENT, "sb3_saf", "hecogrid_envs", "safetensors", "msgspec"))
+    command = [sys.executable, "-c", BESIDE, str(AGENT), hidden, str(tmp_path / "given.npz")]
+    answer = subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder)
+    memory = actor.new_memory() if actor.has_memory else None
+    masks = given.get("masks", [None] * 7)
+    expected = [actor.act(own, action_mask=mask, memory=memory) for own, mask in zip(given["obs"], masks, strict=True)]
     np.testing.assert_allclose(json.loads(answer.stdout), expected, atol=1e-6)
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -40,7 +39,7 @@ from sb3_saf.policies.base import TeamPolicy
 from sb3_saf.policies.ippo import IPPOPolicy
 from sb3_saf.policies.saf import SAFPolicy
 from tests.contrib_teams import MaskedTeams
-from tests.probe_envs import ConstantReward, DelayedReward, Message, Probe
+from tests.probe_envs import ConstantReward, DelayedReward, Message
 from tests.team_venv import TeamVenv
 from tests.test_active import ACTIVE, LIVES
 from tests.test_monitor import RETURN_OF_GAME_0, RETURN_OF_GAME_1
@@ -126,8 +125,8 @@ class TestInHand:
         assert {tag: pytest.approx(written[shown_as[tag]][-1], rel=1e-5) for tag in look.scalars} == look.scalars
         assert shown_as["pool/chosen/policy_2"] == Line("pool/chosen", "policy_2")
         assert shown_as["message/value_error"] == Line("message/value_error", "message_as_read")
-        assert {*look.figures, "episode/strip", "episode/film"} == set(found.Tags()["images"])
-        assert look.film is not None and look.strip is not None
+        assert {*look.figures, "episode/film"} == set(found.Tags()["images"])
+        assert look.film is not None
         shown = found.Images("episode/film")[-1].encoded_image_string
         np.testing.assert_array_equal(
             np.asarray(Image.open(io.BytesIO(look.film))), np.asarray(Image.open(io.BytesIO(shown)))
@@ -163,7 +162,7 @@ class TestPage:
         assert set(page.Tags()["images"]) == {
             *("pool/by_zone", "pool/by_agent", "pool/differences"),
             *("knowledge_source/attention", "knowledge_source/one_episode"),
-            *("critic/calibration", "episode/strip", "episode/film"),
+            *("critic/calibration", "episode/film"),
         }
         for tag in page.Tags()["images"]:
             image = Image.open(io.BytesIO(page.Images(tag)[-1].encoded_image_string))
@@ -246,8 +245,8 @@ def hand_made(policy_class: type[TeamPolicy], env: Any, **kwargs: Any) -> Any:
     )
 
 
-def play(env: Any, policy: TeamPolicy, n_episodes: int = 64, zones: Any = None, gamma: float = 0.5) -> EpisodeRecording:
-    return record_episodes(policy, env, n_episodes, seed=3, zones=zones, gamma=gamma)
+def play(env: Any, policy: TeamPolicy, n_episodes: int = 64, gamma: float = 0.5) -> EpisodeRecording:
+    return record_episodes(policy, env, n_episodes, seed=3, gamma=gamma)
 
 
 class Critic(nn.Module):
@@ -299,33 +298,14 @@ class TestWhatCounts:
         assert ((game.pool_actions[:2, 0, 0] > -1e7) == legal).all()
 
 
-class ZonedProbe(Probe):
-    """Two zones, given by the sign of what an agent sees."""
-
-    def rewards(self, bits: Any, actions: npt.NDArray[np.int64], time: int) -> Any:
-        return bits[:, 0]
-
-    @property
-    def agent_zones(self) -> npt.NDArray[np.int64]:
-        return (self.bits[:, 0] > 0).astype(np.int64)
-
-
-class TestZones:
-    def test_hecogrids_zones_are_those_of_the_agents_columns(self) -> None:
-        env = make_team_env("TeamTogether", n_envs=5, seed=0, n_agents=4, grid_size=12, heterogeneity=3, n_treasures=4)
-        env.reset()
-        columns = np.concatenate(
-            [state["agent_pos"][:, 0] for state in env.env_method("get_state", indices=range(0, 20, 4))]
-        )
-        np.testing.assert_array_equal(zones_by_attribute(env), columns // 4)
-        assert len(env.get_attr("zone_colours", indices=[0])[0]) == 3
-
-    def test_zones_that_are_no_zones_are_refused(self) -> None:
-        env = make_team_env(ZonedProbe(), n_envs=2)
-        policy = hand_made(SAFPolicy, env)
-        for wrong, got in (([0, 1], r"got shape \(2,\)"), ([0.0] * 4, "dtype float64"), ([-2] * 4, "with -2")):
-            with pytest.raises(ValueError, match=rf"expected zones to give whole numbers .* of shape \(4,\).*{got}"):
-                play(env, policy, zones=lambda env, wrong=wrong: np.array(wrong))
+def test_hecogrids_zones_are_those_of_the_agents_columns() -> None:
+    env = make_team_env("TeamTogether", n_envs=5, seed=0, n_agents=4, grid_size=12, heterogeneity=3, n_treasures=4)
+    env.reset()
+    columns = np.concatenate(
+        [state["agent_pos"][:, 0] for state in env.env_method("get_state", indices=range(0, 20, 4))]
+    )
+    np.testing.assert_array_equal(zones_by_attribute(env), columns // 4)
+    assert len(env.get_attr("zone_colours", indices=[0])[0]) == 3
 
 
 class TestMessages:
@@ -415,23 +395,21 @@ def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> No
 # --- arguments --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "arguments", [{"every_game_steps": 0}, {"n_eval_episodes": 2.5}, {"seed": -1}, {"zones": "agent_zones"}]
-)
+@pytest.mark.parametrize("arguments", [{"every_game_steps": 0}, {"n_eval_episodes": 2.5}, {"seed": -1}])
 def test_bad_arguments(arguments: dict[str, Any]) -> None:
     ((name, value),) = arguments.items()
     with pytest.raises(ValueError, match=f"{name} must be .*got {value!r}"):
         InspectionCallback(ToyTeams(), **arguments)
 
 
-def test_environments_that_do_not_fit() -> None:
+def test_environments_that_do_not_fit(tmp_path: Path) -> None:
     env = ToyTeams()
     probes = [make_team_env(DelayedReward(), n_envs=1, time_limit=limit) for limit in ("terminal", "bootstrap")]
     cases: list[tuple[Any, Any, str]] = [
         (env, env, "eval_env is the training environment"),
-        (env, ToyTeams(n_agents=2), "eval_env to have the observation_space of the training"),
+        (env, ToyTeams(n_agents=2), "expected games like those .* 3 agents, got .* 2 agents"),
         (probes[0], probes[1], r"as training does \(time_limit='terminal'\), got 'bootstrap'"),
     ]
     for training, evaluation, message in cases:
         with pytest.raises(ValueError, match=message):
-            learn(None, InspectionCallback(evaluation), env=training)
+            learn(tmp_path, InspectionCallback(evaluation), env=training)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
@@ -82,10 +81,8 @@ def test_shared_rewards_count_once(model: PPO, team_reward: Any, tmp_path: Path)
         record_episodes(model.policy, make_env(), 2, SEED).episode_returns
     )
     assert recording.episode_returns[0] > 0
-    sb3_saf.export_actors(model, tmp_path / "actor")
-    for player in (model, sb3_saf.Actor.load(tmp_path / "actor")):
-        (run,) = data_of(replay(player, env, tmp_path / "page.html", seed=SEED))["runs"]
-        assert unpacked(run["rewards"]).sum() == pytest.approx(sum(step >= 0 for step in run["collected"]))
+    (run,) = data_of(replay(model, env, tmp_path / "page.html", seed=SEED))["runs"]
+    assert unpacked(run["rewards"]).sum() == pytest.approx(sum(step >= 0 for step in run["collected"]))
 
 
 def test_each_model_has_its_own_discount(model: PPO, tmp_path: Path) -> None:
@@ -128,22 +125,11 @@ def test_methods_without_parts(policy: str, tmp_path: Path) -> None:
     assert run["of_team"] == policy.startswith("QPLEX") and "values" in run
 
 
-@pytest.mark.parametrize("kind", ["memoryless", "heads per agent, memory", "qplex with memory"])
-def test_exported_actors_and_models_side_by_side(kind: str, model: Any, tmp_path: Path) -> None:
-    if kind != "memoryless":
-        algorithm: Any = sb3_saf.QPLEX if kind.startswith("qplex") else PPO
-        kwargs = {"memory": "gru", "heads": "per_agent"}
-        model = algorithm(
-            f"{'QPLEX' if algorithm is not PPO else 'MAPPO'}Policy", make_env(), seed=0, policy_kwargs=kwargs
-        )
-        for parameter in model.policy.parameters():
-            parameter.data.add_(0.3 * th.randn_like(parameter))
-    sb3_saf.export_actors(model, tmp_path / "actor")
-    players: dict[str, Any] = {"model": model, "<b>actor</b>": sb3_saf.Actor.load(tmp_path / "actor")}
-    page = replay(players, make_env(), tmp_path / "page.html", deterministic=True)
+def test_names_are_text(model: PPO, tmp_path: Path) -> None:
+    page = replay({"model": model, "<b>other</b>": model}, make_env(), tmp_path / "page.html")
     first, second = data_of(page)["runs"]
-    assert second["actions"] == first["actions"] and second["pose"] == first["pose"] and "values" not in second
-    assert "<b>actor" not in page.read_text()
+    assert (first["name"], second["name"]) == ("model", "<b>other</b>") and second["actions"] == first["actions"]
+    assert "<b>other" not in page.read_text()
 
 
 def test_other_games_are_shown_by_their_pictures_and_names(tmp_path: Path) -> None:
@@ -262,7 +248,6 @@ def test_returns_have_the_scale_of_values_that_were_learned_with_normalize(tmp_p
     ("given", "message"),
     [
         (["--model", "nowhere.zip"], "--model nowhere.zip is not there"),
-        (["--model", "nowhere.zip", "--env", "Nothing-v0"], "--model nowhere.zip is not there"),
         (["--model", __file__, "--size", "huge"], "unknown size 'huge'"),
         (["--model", __file__], "does not hold the tensors of a saved model"),
     ],

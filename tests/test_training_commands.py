@@ -86,7 +86,7 @@ def test_tensorboard_has_the_inside_of_the_policy_and_training_does_not_notice(a
     (file,) = (tmp_path / "tb").glob("*/*/events.*")
     found = EventAccumulator(str(file)).Reload()
     assert [event.step for event in found.Scalars("team/return")] == [0, 40]
-    assert {"episode/strip", "critic/calibration"} <= set(found.Tags()["images"])
+    assert {"episode/film", "critic/calibration"} <= set(found.Tags()["images"])
     assert b"TeamTogether" in found.PluginTagToContent("hparams")["_hparams_/session_start_info"]
 
 

@@ -156,11 +156,6 @@ def seeds_of(values: list[float], **columns: object) -> pd.DataFrame:
     return pd.DataFrame({"seed": range(len(values)), "return_mean": values}).assign(**columns)
 
 
-def test_intervals_are_students_for_any_number_of_runs() -> None:
-    """Five runs of 1 to 5: 3 +- 1.963 (marl-eval assumes ten runs and the normal distribution: 0.877)."""
-    assert mean_over_seeds([1.0, 2.0, 3.0, 4.0, 5.0]) == pytest.approx((3, 3 - 1.963, 3 + 1.963), abs=5e-4)
-
-
 def test_paired_differences_are_tested_over_common_seeds() -> None:
     first, second = seeds_of([3.0, 3.5, 3.1, 9.0]), seeds_of([1.0, 1.1, 1.3])
     found = compare(first, second)

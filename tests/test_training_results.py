@@ -79,7 +79,6 @@ def test_latest_run_by_default_and_other_models_on_demand(logs: Path, capsys: py
     for option, name in (
         (["--load-best"], "best_model.zip"),
         (["--load-checkpoint", "80"], "rl_model_80_steps.zip"),
-        (["--load-last-checkpoint"], "rl_model_160_steps.zip"),
     ):
         result = enjoy(logs, "--exp-id", "1", "--no-render", *option)
         printed = capsys.readouterr().out

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import torch as th
 
-from sb3_saf.export.writer import read_weights
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.commands import check_device
 from sb3_saf.training.folders import Run, python_command
 from sb3_saf.training.run import SeededEvalCallback
+from tests.kill_harness import results_of
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
@@ -43,20 +41,6 @@ def struck(folder: Path, algo: str, *options: str, error: type[BaseException] = 
             train(folder, algo, "--seed", "3", *options)
 
 
-def left(run: Path) -> dict[str, Any]:
-    """Return the output of a run."""
-    weights = read_weights(run / f"{ENV}.zip")
-    with np.load(run / "evaluations.npz") as arrays:
-        evaluations = {name: arrays[name].tobytes() for name in arrays.files}
-    episodes = [line.rsplit(",", 1)[0] for line in (run / "monitor.csv").read_text().splitlines()[1:]]
-    return {
-        "weights": {name: tensor.numpy().tobytes() for name, tensor in weights.items()},
-        "evaluations": evaluations,
-        "episodes": episodes,
-        "settings": Run(run).description["settings"],
-    }
-
-
 @pytest.mark.parametrize(
     ("algo", "more"),
     [("saf", ("-params", "callback:sb3_saf.EntropySchedule")), ("qplex", ("--inspect-freq", "100000"))],
@@ -73,7 +57,7 @@ def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
     train(tmp_path / "run", algo, *options)  # the seed is the run's
     assert f"Going on with {tmp_path}" in capsys.readouterr().out
     one, other = (tmp_path / name / algo / f"{ENV}_1" for name in ("undisturbed", "run"))
-    assert left(one) == left(other)
+    assert results_of(one) == results_of(other) != {}
     assert {path.name for path in one.iterdir()} == {path.name for path in other.iterdir()} >= {"finished.json"}
     assert not (other / "checkpoints").exists()
     assert [path.name for path in (tmp_path / "run" / algo).iterdir()] == [f"{ENV}_1"]
@@ -91,7 +75,7 @@ def test_ctrl_c_leaves_model_and_checkpoint_and_says_how_to_go_on(
     assert command.startswith(python_command("sb3_saf.train"))
     zoo_train.main(shlex.split(command)[3:])
     train(tmp_path / "undisturbed", "saf", "--seed", "3")
-    assert left(run) == left(tmp_path / "undisturbed" / "saf" / f"{ENV}_1")
+    assert results_of(run) == results_of(tmp_path / "undisturbed" / "saf" / f"{ENV}_1") != {}
 
 
 def test_other_settings_begin_another_run(tmp_path: Path) -> None:

@@ -414,7 +414,6 @@ def resumable_learn(
     keep: int = 3,
     exact: bool | None = None,
     trust_games: bool = False,
-    finite: bool = True,
     again: str = "start the same command again to go on from there",
     **learn_arguments: Any,
 ) -> BaseAlgorithm:
@@ -432,7 +431,6 @@ def resumable_learn(
     :param keep: see :class:`TeamCheckpointCallback`
     :param exact: see :class:`TeamCheckpointCallback`
     :param trust_games: see :func:`resume`
-    :param finite: whether to check for NaN and infinity, see :class:`~sb3_saf.FiniteCallback`
     :param again: advice in the message after Ctrl-C and SIGTERM
     :param learn_arguments: further arguments of ``model.learn``
     :return: the model
@@ -441,8 +439,6 @@ def resumable_learn(
     """
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
     checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, given, exact, verbose=model.verbose)
-    # First, so that data are checked before they are written.
-    before: list[BaseCallback] = [FiniteCallback(), GameStepsCallback()] if finite else [GameStepsCallback()]
     checkpoints.store.acquire()
     try:
         if checkpoints.store.checkpoints():
@@ -452,7 +448,10 @@ def resumable_learn(
             learn_arguments["reset_num_timesteps"] = False
             total_timesteps -= model.num_timesteps
         with settings_restored_on_error(model), _saved_on_interrupt(checkpoints, is_off_policy(model), again):
-            model.learn(total_timesteps, [*before, checkpoints, *given], **learn_arguments)
+            # The check is first, so that data are checked before they are written.
+            model.learn(
+                total_timesteps, [FiniteCallback(), GameStepsCallback(), checkpoints, *given], **learn_arguments
+            )
     finally:
         checkpoints.store.release()
     return model

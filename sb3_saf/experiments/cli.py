@@ -241,10 +241,9 @@ def _engine(options: argparse.Namespace) -> Engine:
 def _list(options: argparse.Namespace) -> int:
     for experiment in EXPERIMENTS.values():
         print(f"{experiment.name:<19}{experiment.question}")
-        if experiment.is_grid:
-            tasks = ", ".join(env.removesuffix("-v0") for env in experiment.envs)
-            for line in (f"{', '.join(experiment.methods)} on {tasks}", *map(str, experiment.views)):
-                print(f"{'':<19}  {line}")
+        tasks = ", ".join(env.removesuffix("-v0") for env in experiment.envs)
+        for line in (f"{', '.join(experiment.methods)} on {tasks}", *map(str, experiment.views)):
+            print(f"{'':<19}  {line}")
     return 0
 
 
@@ -252,17 +251,12 @@ def _plan(options: argparse.Namespace) -> int:
     from sb3_saf.experiments.run import make_plan
 
     experiment, results, selection = _subject(options)
-    if not experiment.is_grid:
-        print(f"{experiment.name}: counts weights, trains nothing")
-        return 0
     print(make_plan(experiment, selection, _config(options, experiment), results, Shard.parse(options.shard)))
     return 0
 
 
 def _run(options: argparse.Namespace) -> int:
     experiment, results, selection = _subject(options)
-    if not experiment.is_grid:
-        return _print_parameters()
     require("pandas")
     from sb3_saf.experiments.run import CellOptions, run
 
@@ -290,8 +284,6 @@ def _run(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     experiment, results, selection = _subject(options)
     name = experiment.name
-    if not experiment.is_grid:
-        return _print_parameters()
     require("pandas", "matplotlib", "rliable")
     remedy = f"run it first: {python_command(MODULE)} run {name} --size {_size(options)} -f {results.folder}"
     if not results.folder.is_dir():
@@ -307,13 +299,6 @@ def _report(options: argparse.Namespace) -> int:
     print(f"figures: {', '.join(path.name for path in report.figures)}")
     if report.missing:
         print(f"{len(report.missing)} of {report.n_cells} cells are missing; the page names them", file=sys.stderr)
-    return 0
-
-
-def _print_parameters() -> int:
-    from sb3_saf.parameters import format_table, parameter_table
-
-    print(format_table(parameter_table()))
     return 0
 
 

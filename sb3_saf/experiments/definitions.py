@@ -165,14 +165,9 @@ class Experiment(NamedTuple):
 
     name: str
     question: str
-    envs: tuple[str, ...] = ()
-    methods: tuple[str, ...] = ()
-    views: tuple[View, ...] = ()
-
-    @property
-    def is_grid(self) -> bool:
-        """Whether the experiment has cells to train."""
-        return bool(self.views)
+    envs: tuple[str, ...]
+    methods: tuple[str, ...]
+    views: tuple[View, ...]
 
     @property
     def vary(self) -> dict[str, list[Any]]:
@@ -280,7 +275,6 @@ _ALL: Final = (
     Experiment(
         "qplex", "does a pool help value factorisation?", _THREE_TASKS, ("qplex", "qplex-pool"), (_FIVE_AGENTS,)
     ),
-    Experiment("parameters", "the parameter table"),
 )
 EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for experiment in _ALL}
 
@@ -400,26 +394,6 @@ class RunConfig:
         return plain({"settings": settings, "seed": cell.seed, "options": options})
 
 
-class LeftOut(NamedTuple):
-    """A level that does not fit the size, for training or for a test, and the reason."""
-
-    task: str
-    level: Level
-    test: Level
-    reason: str
-
-    def __str__(self) -> str:
-        where = "training" if self.test == self.level else f"the test at {self.test} after training"
-        return f"{self.task}: {where} at {self.level} is left out: {self.reason}"
-
-
-class Grid(NamedTuple):
-    """All cells of an experiment, ordered so that every section has all methods, and the levels that do not fit."""
-
-    cells: list[Cell]
-    left_out: list[LeftOut]
-
-
 @dataclass(frozen=True)
 class Selection:
     """
@@ -453,34 +427,32 @@ class Selection:
         )
 
 
-def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> Grid:
+def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> list[Cell]:
     """
-    Return the grid of an experiment: its methods and a random team, at every level that fits.
+    Return the cells of an experiment, its methods and a random team, ordered so that every section has all methods.
 
-    :raises ValueError: for levels that the experiment lacks, or if none fits
+    :raises ValueError: for levels that the experiment lacks, or that cannot be made in the size
     """
-    methods = selection.methods or experiment.methods
-    left_out: list[LeftOut] = []
-    trained: list[Cell] = []
-    fitting: list[tuple[str, Level, tuple[Level, ...]]] = []
-    for env in selection.envs or experiment.envs:
-        for level, tests in experiment.at(selection.levels).tests().items():
-            bad: dict[Level, str] = {}
-            for one in {level, *tests}:
-                try:
-                    config.settings(Cell(RANDOM, env, one, 0))
-                except ValueError as error:  # it cannot be built
-                    bad[one] = str(error)
-            wrong = [level] if level in bad else [test for test in tests if test in bad]
-            left_out += [LeftOut(env.removesuffix("-v0"), level, test, bad[test]) for test in wrong]
-            if level not in bad:
-                fitting.append((env, level, tuple(test for test in tests if test not in bad)))
-    if not fitting:
-        raise ValueError(f"no level of {experiment.name} fits the size {config.size!r}: {left_out[0].reason}")
-    for seed in selection.seeds:
-        trained += [Cell(method, env, level, seed, tests) for env, level, tests in fitting for method in methods]
+    levels = experiment.at(selection.levels).tests()
+    envs, methods = selection.envs or experiment.envs, selection.methods or experiment.methods
+    for env in envs:
+        for level in dict.fromkeys(one for train, tests in levels.items() for one in (train, *tests)):
+            try:
+                config.settings(Cell(RANDOM, env, level, 0))
+            except ValueError as error:
+                raise ValueError(
+                    f"{env.removesuffix('-v0')} at {level} cannot be made in the size {config.size!r}: {error}; or "
+                    "leave the level out with --levels"
+                ) from error
+    trained = [
+        Cell(method, env, level, seed, tests)
+        for seed in selection.seeds
+        for env in envs
+        for level, tests in levels.items()
+        for method in methods
+    ]
     random = [Cell(RANDOM, cell.env, level, cell.seed, (level,)) for cell in trained for level in cell.tests]
-    return Grid(merge([*trained, *random]), left_out)
+    return merge([*trained, *random])
 
 
 def merge(cells: Iterable[Cell]) -> list[Cell]:

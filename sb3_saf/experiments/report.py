@@ -25,7 +25,6 @@ from sb3_saf.experiments.definitions import (
     RANDOM,
     Cell,
     Experiment,
-    LeftOut,
     Level,
     RunConfig,
     Selection,
@@ -84,8 +83,8 @@ def write_report(
     """
     config = results.config()
     assert config is not None
-    asked, shown = requested(experiment, results), experiment.at(wanted.levels)
-    cells = [cell for cell in asked.cells if wanted.has(cell, experiment)]
+    shown = experiment.at(wanted.levels)
+    cells = [cell for cell in requested(experiment, results) if wanted.has(cell, experiment)]
     tests, curves = write_tables(experiment, results)
     names = [(cell.id, level.slug) for cell in cells for level in cell.tests]
     tests = tests[keys_of(tests, "cell", "level").isin(names)] if len(tests) else tests
@@ -99,7 +98,7 @@ def write_report(
         frames = beside(frames, others)
     figures = {**_views(shown, frames), **_aggregates(shown, frames), **_curves(shown, frames)}
     missing = [cell for cell in cells if results.missing_tests(cell)]
-    content = Content(shown, config, results, cells, missing, asked.left_out, frames, list(figures))
+    content = Content(shown, config, results, cells, missing, frames, list(figures))
     suite = find_environment(experiment.envs[0]).suite
     environment = "games" if suite is None else suite.name
     folder = results.folder / experiment.name
@@ -209,7 +208,6 @@ class Content(NamedTuple):
     Content of a page.
 
     :param cells: all requested cells
-    :param left_out: levels that do not fit the size
     :param frames: tables of tests and curves, see ``tables``
     """
 
@@ -218,7 +216,6 @@ class Content(NamedTuple):
     results: Results
     cells: Sequence[Cell]
     missing: Sequence[Cell]
-    left_out: Sequence[LeftOut]
     frames: Frames
     figures: Sequence[str]
 
@@ -270,7 +267,7 @@ def _numbers(column: pd.Series) -> str:
 
 def _missing(content: Content) -> str:
     results = content.results
-    lines = [f"- {_text(left_out)}" for left_out in content.left_out]
+    lines = []
     if content.missing:
         lines.append(
             f"- **{len(content.missing)} of {len(content.cells)} cells are missing**; numbers below lack them:"

@@ -1,20 +1,6 @@
 """
-Folder of results. A finished cell is one folder of a run (``training/folders.py``), which appears at once.
-
-    settings.json                    configuration of all cells
-    cells/TeamTogether-c2-h1/saf/seed-0/
-        run.json                     everything that determines the result; command and software
-        curve.csv  evaluations.csv   returns of the training episodes, and of the evaluations during training
-        model.zip  best_model.zip    the last policy, and the best one by the evaluations
-        tests/c2-h1.json             returns of the test episodes of both, with drawn and with most likely actions
-        finished.json                cost, and the digests of these files
-    unfinished/TeamTogether-c2-h1/saf/seed-1/
-        job.json  result/            the job; the folder of its run
-        error.txt  log.txt           error and log of the last attempt
-    damaged/...                      cells with changed or missing files, after they were run again
-    coordination/experiment.json     a user's experiment
-    coordination/selections/*.json   requested selections, for missing cells in reports
-    coordination/runs.csv            one row per cell and test level, made from the cells; curves.csv beside it
+Folder of results (``docs/experiments.md``, "Cells"): cells, each a folder of a run, which appears at once when the cell
+is finished, the configuration of all cells, and for each experiment what was requested, for missing cells in reports.
 """
 
 from __future__ import annotations

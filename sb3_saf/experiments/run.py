@@ -34,9 +34,9 @@ def make_plan(
     shard: Shard = Shard(),  # noqa: B008 (immutable)
 ) -> str:
     """Return the cells, the game steps and, if cells are finished, the remaining time, as text."""
-    grid = expand(experiment, selection, config)
-    results.agree(config, grid.cells)
-    cells = shard.of(grid.cells)
+    everything = expand(experiment, selection, config)
+    results.agree(config, everything)
+    cells = shard.of(everything)
     trained = [cell for cell in cells if cell.is_trained]
     finished = [(cell, run) for cell in trained if (run := results.run(cell)) is not None]
     steps = {cell.id: config.settings(cell).game_steps for cell in trained}
@@ -59,7 +59,6 @@ def make_plan(
     lines = [
         f"{experiment.name}, size {config.size}: {experiment.question}",
         *settings,
-        *(f"left out    {left_out}" for left_out in grid.left_out),
         f"cells       {len(trained)} to train ({product}), {len(finished)} of them finished",
         f"tests       {n_tests} to play, of {config.episodes} team episodes each, random teams included",
         f"game steps  {left:,} left of {sum(steps.values()):,} ({each} a cell)",
@@ -123,21 +122,19 @@ def run(
     :param engine: closed at the end
     :raises ValueError: for invalid arguments, before the first cell starts
     """
-    grid = expand(experiment, selection, config)
+    everything = expand(experiment, selection, config)
     results.check_experiment(experiment)
-    results.agree(config, grid.cells)
-    cells = shard.of(grid.cells)
+    results.agree(config, everything)
+    cells = shard.of(everything)
     todo = [cell for cell in cells if results.missing_tests(cell)]
     progress = _Progress(todo, config, results, engine, options or CellOptions())
     results.save_config(config)  # of settings with which all cells can be made
     results.add_selection(experiment, selection)
-    for left_out in grid.left_out:
-        print(left_out)
     for error in results.damaged.values():
         print(f"damaged, what it belongs to is run again: {error}")
     part = "" if shard.parts == 1 else f", {len(cells)} of them in part {shard}"
     print(
-        f"{experiment.name}: {len(grid.cells)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
+        f"{experiment.name}: {len(everything)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
         f"{results.folder}"
     )
     # On a terminal a bar with the remaining time; in a log file a line per cell.

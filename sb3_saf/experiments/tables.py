@@ -51,7 +51,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from sb3_saf.experiments.definitions import MODULE, RANDOM, Cell, Experiment, Grid, Level, View, expand, merge
+from sb3_saf.experiments.definitions import MODULE, RANDOM, Cell, Experiment, Level, View, expand, merge
 from sb3_saf.experiments.results import BEST, BEST_MODEL, EVALUATIONS, LAST, MOST_LIKELY, Results
 from sb3_saf.export.writer import save_weights
 from sb3_saf.teams.files import read_json, write_json, write_text
@@ -98,7 +98,7 @@ def read_results(folder: str | Path, name: str) -> Frames:
                 raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
             return Frames(tests, curves)
     experiment = results.experiment(name)
-    cells = [] if results.config() is None else requested(experiment, results).cells
+    cells = [] if results.config() is None else requested(experiment, results)
     tests = frame_of_tests(results, cells)
     if tests.empty:
         raise ValueError(
@@ -141,14 +141,13 @@ def keys_of(table: pd.DataFrame, *columns: str) -> pd.Series:
     return pd.Series(list(table[list(columns)].itertuples(index=False, name=None)), index=table.index, dtype=object)
 
 
-def requested(experiment: Experiment, results: Results) -> Grid:
+def requested(experiment: Experiment, results: Results) -> list[Cell]:
     """Return all cells ever requested in a folder with settings, random teams last."""
     config = results.config()
     assert config is not None
-    grids = [expand(experiment, selection, config) for selection in results.selections(experiment.name)]
-    cells = merge(cell for grid in grids for cell in grid.cells)
-    left_out = dict.fromkeys(left_out for grid in grids for left_out in grid.left_out)
-    return Grid(sorted(cells, key=lambda cell: not cell.is_trained), list(left_out))
+    selections = results.selections(experiment.name)
+    cells = merge(cell for selection in selections for cell in expand(experiment, selection, config))
+    return sorted(cells, key=lambda cell: not cell.is_trained)
 
 
 def frame_of_tests(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
@@ -225,7 +224,7 @@ def best_game_steps(folder: Path) -> int:
 
 def write_tables(experiment: Experiment, results: Results) -> Frames:
     """Write ``runs.csv`` and ``curves.csv`` of all requested and finished cells, with exact floats; return them."""
-    cells = requested(experiment, results).cells
+    cells = requested(experiment, results)
     frames = Frames(frame_of_tests(results, cells), frame_of_curves(results, cells))
     for name, frame in zip((RUNS, CURVES), frames, strict=True):
         write_text(results.folder / experiment.name / name, frame.to_csv(index=False, lineterminator="\n"))
@@ -234,7 +233,7 @@ def write_tables(experiment: Experiment, results: Results) -> Frames:
 
 def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     """
-    Write teams for others to play, see ``training/folders.py``: of each task, level and method of a folder of
+    Write teams for others to play (``docs/zoo.md``, "Trained teams"): of each task, level and method of a folder of
     experiments the seed with the best test at the level of its training.
 
     :param target: folder of all teams; a team of the same name is replaced

@@ -1,23 +1,19 @@
 """
 Act with an exported actor. Needs only Python, NumPy and onnxruntime.
 
-    python act.py observation.npy [--agent 3] [--action-mask mask.npy] [--sample] [--seed 0]
-
-or, from a program beside this file:
+A program beside this file::
 
     from act import Actor
     actor = Actor.load("folder of actor.onnx")
     action = actor.act(observation)
 
-An actor with memory takes ``memory=actor.new_memory()``, a new one for each episode; on the command line, the
-observations of such an actor are the steps of one episode.
+An actor with memory takes ``memory=actor.new_memory()``, a new one for each episode.
 
 Letters: K rows (a batch of observations), M choices of all action dimensions, A actions.
 """
 
 from __future__ import annotations
 
-import argparse
 import base64
 import json
 from collections.abc import Mapping
@@ -361,33 +357,3 @@ def _fits(array: Array, dtype: np.dtype[Any]) -> bool:
         return True
     with np.errstate(invalid="ignore"):
         return bool((array.astype(dtype) == array).all())
-
-
-def main() -> None:
-    """Print the action for an observation in a ``.npy`` file."""
-    parser = argparse.ArgumentParser(description="act with an exported actor")
-    parser.add_argument(
-        "observation", help="a .npy file of one own observation, or of a batch (with a memory: of an episode's steps)"
-    )
-    parser.add_argument("--folder", default=Path(__file__).parent, help="the exported folder; this file's own")
-    parser.add_argument("--agent", help="index or name of the agent that acts, where the action depends on it")
-    parser.add_argument("--action-mask", help="a .npy file with the legal actions of each observation")
-    parser.add_argument("--sample", action="store_true", help="draw the action instead of taking the most likely one")
-    parser.add_argument("--seed", type=int, help="seed of --sample")
-    options = parser.parse_args()
-    agent = int(options.agent) if options.agent and options.agent.isdigit() else options.agent
-    actor = Actor.load(options.folder, agent)
-    rng = np.random.default_rng(options.seed)
-    observations = np.load(options.observation, allow_pickle=False)
-    masks = None if options.action_mask is None else np.load(options.action_mask, allow_pickle=False)
-    if not actor.has_memory:
-        actions = actor.act(observations, not options.sample, rng, masks)
-    else:
-        memory, masks = actor.new_memory(), [None] * len(observations) if masks is None else masks
-        steps = zip(observations, masks, strict=True)
-        actions = np.stack([actor.act(own, not options.sample, rng, mask, memory) for own, mask in steps])
-    print(json.dumps(actions.tolist()))
-
-
-if __name__ == "__main__":
-    main()

@@ -66,7 +66,7 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
     ============== =================================================================================================
     ``actor.onnx`` the graph from raw observations to actions, and what describes it (spaces, agents, masks, pixels
                    of tile codes) as metadata
-    ``act.py``     :class:`sb3_saf.Actor` as a program that needs only NumPy and onnxruntime
+    ``act.py``     :class:`sb3_saf.Actor` as a module that needs only NumPy and onnxruntime
     ============== =================================================================================================
 
     The critic is not exported, nor are VecNormalize's statistics, of which a warning tells. ``sb3_saf.Actor.load``

@@ -24,14 +24,11 @@ from sb3_saf.inspection import figures
 from sb3_saf.inspection import scalars as numbers
 from sb3_saf.inspection.recording import (
     EpisodeRecording,
-    Picture,
     ReturnScale,
-    Zones,
     record_episodes,
     require_our_policy,
     return_scale,
     zone_colours,
-    zone_function,
 )
 from sb3_saf.inspection.tensorboard import Page, hyperparameters
 from sb3_saf.qplex.policies import QPLEXPolicy
@@ -105,11 +102,6 @@ class Inspection(NamedTuple):
         """The first episode as a GIF; None if the environment draws no pictures. Needs Pillow."""
         return figures.gif(self.recording.pictures) if self.recording.pictures else None
 
-    @property
-    def strip(self) -> Picture | None:
-        """Six moments of the first episode, (height, width, 3); None if the environment draws no pictures."""
-        return figures.strip(self.recording.pictures) if self.recording.pictures else None
-
 
 def inspect_team(
     model: BaseAlgorithm,
@@ -117,7 +109,6 @@ def inspect_team(
     n_eval_episodes: int = 16,
     seed: int = 20_000,
     deterministic: bool = False,
-    zones: Zones = None,
     *,
     pictures: bool = True,
     observations: bool = True,
@@ -134,7 +125,6 @@ def inspect_team(
     :param n_eval_episodes: team episodes to play
     :param seed: seed of the episodes
     :param deterministic: whether the policy takes its most likely actions
-    :param zones: as in :class:`~sb3_saf.InspectionCallback`
     :param pictures: whether to draw the first game
     :param observations: whether to record the agents' own observations
     :raises ValueError: if the policy is not of this package or ``eval_env`` has no teams
@@ -146,7 +136,6 @@ def inspect_team(
         seed,
         deterministic,
         gamma=float(getattr(model, "gamma", 1.0)),
-        zones=zones,
         normalizer=model.get_vec_normalize_env(),
         observations=observations,
         pictures=pictures,
@@ -161,7 +150,7 @@ class InspectionCallback(BaseCallback):
 
     Every ``every_game_steps``, and before and after training, the policy plays a fixed set of team episodes. The run's
     TensorBoard file gets team returns; the pool's selection by zone and by agent; attention and messages of the
-    knowledge source; the critic's calibration, with and without messages; an episode as pictures; hyperparameters; a
+    knowledge source; the critic's calibration, with and without messages; an episode as a film; hyperparameters; a
     text that explains the tags; and a layout of the custom scalars page. ``docs/tensorboard.md`` explains the results.
     Parts that a policy or an environment lacks are omitted.
 
@@ -174,8 +163,6 @@ class InspectionCallback(BaseCallback):
     :param seed: seed of the episodes, which are the same at every inspection
     :param deterministic: whether the policy takes its most likely actions, as QPLEX always does; others sample in
         training
-    :param zones: a function from ``eval_env`` to the zone of each row's agent, (B,) integers from 0; None uses the
-        games' ``agent_zones``, as in HECOGrid; False for no zones
     :param pictures: whether to draw figures and episodes, which needs matplotlib and Pillow; False writes numbers only
     :param hparams: additional hyperparameters to show, such as the task and its level
     :param verbose: 1 prints a line per inspection
@@ -192,7 +179,6 @@ class InspectionCallback(BaseCallback):
         n_eval_episodes: int = 16,
         seed: int = 20_000,
         deterministic: bool = False,
-        zones: Zones = None,
         pictures: bool = True,
         hparams: Mapping[str, object] | None = None,
         verbose: int = 0,
@@ -203,7 +189,6 @@ class InspectionCallback(BaseCallback):
         check_count("n_eval_episodes", n_eval_episodes)
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
             raise ValueError(f"seed must be an integer of at least 0, got {seed!r}")
-        zone_function(eval_env, zones)  # refuses what is no function
         if pictures:
             try:
                 import matplotlib  # noqa: F401
@@ -217,7 +202,6 @@ class InspectionCallback(BaseCallback):
         self.pictures = pictures
         self.hparams = dict(hparams or {})
         self.n_eval_episodes, self.seed, self.deterministic = n_eval_episodes, int(seed), deterministic
-        self.zones = zones
         #: Seconds spent so far.
         self.seconds = 0.0
         self._next = 0
@@ -271,7 +255,6 @@ class InspectionCallback(BaseCallback):
             self.n_eval_episodes,
             self.seed,
             self.deterministic,
-            self.zones,
             pictures=self.pictures,
             observations=False,
         )
@@ -283,9 +266,7 @@ class InspectionCallback(BaseCallback):
                 self._page.show("rollout/team_return_of_each_episode", recent)
             for tag, figure in inspection.figures.items():
                 self._page.show(tag, logger.Figure(figure, close=True))
-            strip, film = inspection.strip, inspection.film
-            if strip is not None and film is not None:
-                self._page.show("episode/strip", logger.Image(strip, "HWC"))
+            if (film := inspection.film) is not None:
                 self._page.gif("episode/film", film, team_steps(self.model))
         self._page.scalars(scalars)
         self.seconds += time.perf_counter() - began
@@ -307,13 +288,6 @@ def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:
             "eval_env is the training environment; inspections would play on its games: make another one, for instance "
             "with sb3_saf.make_team_env and a seed of its own"
         )
-    for name in ("observation_space", "action_space"):
-        of_training, of_eval = getattr(training_env, name), getattr(eval_env, name)
-        if of_training != of_eval:
-            raise ValueError(
-                f"expected eval_env to have the {name} of the training environment, {of_training}, got {of_eval}; make "
-                "both with the same arguments"
-            )
     limits = [
         next((layer.time_limit for layer in layers(env) if isinstance(layer, CentralizedValueWrapper)), None)
         for env in (training_env, eval_env)

@@ -1,5 +1,5 @@
 """
-Figures of the TensorBoard page, and an episode as pictures: a few moments in two rows, and a GIF.
+Figures of the TensorBoard page, and an episode as a GIF.
 
 Colours are safe for colour-blind readers (Okabe and Ito's, and cividis); zones have the environment's colours. Letters:
 U policies, K zones, N agents, L slots, T game steps, n values.
@@ -159,23 +159,20 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
     return figure
 
 
-def calibration(
-    values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration, unit: str | None, n_bins: int = 10
-) -> Figure:
+def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration, unit: str | None) -> Figure:
     """
-    Draw values against returns, and mean returns of bins of equal counts by value.
+    Draw values against returns, and mean returns of tenths by value.
 
     :param values: (n,)
     :param returns: (n,)
     :param unit: unit of returns
-    :param n_bins: at most
     """
     figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
     axes.scatter(values[few], returns[few], s=6, alpha=0.25, color=_GREY, linewidths=0, label="single steps")
     ends = [float(min(values.min(), returns.min())), float(max(values.max(), returns.max()))]
     axes.plot(ends, ends, color="black", linestyle="--", linewidth=1, label="value = return")
-    bins = np.array_split(np.argsort(values, kind="stable"), min(n_bins, len(values)))
+    bins = np.array_split(np.argsort(values, kind="stable"), min(10, len(values)))
     axes.errorbar(
         [float(values[rows].mean()) for rows in bins],
         [float(returns[rows].mean()) for rows in bins],
@@ -203,27 +200,9 @@ def calibration(
 
 # --- pictures of an episode -------------------------------------------------------------------------------------------
 
-#: Height in pixels of a moment in the strip of six moments, three to a row, and of the GIF.
+#: Largest height in pixels of the GIF.
 _HEIGHT: Final = 320
-_GAP: Final = 6
-_N_MOMENTS: Final = 6
-_PER_ROW: Final = 3
 _COLOURS: Final = 64
-
-
-def strip(pictures: Sequence[Picture]) -> Picture:
-    """Join six evenly spaced pictures (height, width, 3) in two rows, or all in one row if there are fewer."""
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, _N_MOMENTS).round().astype(int))
-    moments = [_scaled(pictures[index]) for index in chosen]
-    rows = [moments] if len(moments) < _N_MOMENTS else [moments[:_PER_ROW], moments[_PER_ROW:]]
-    return _joined([_joined(row, axis=1) for row in rows], axis=0)
-
-
-def _joined(pictures: Sequence[Picture], axis: int) -> Picture:
-    """Join pictures with white gaps."""
-    height, width, _ = pictures[0].shape
-    gap = np.full((height, _GAP, 3) if axis == 1 else (_GAP, width, 3), 255, dtype=np.uint8)
-    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)
 
 
 def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:

@@ -25,7 +25,7 @@ action distribution.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
@@ -215,10 +215,6 @@ Doubles = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Picture = npt.NDArray[np.uint8]
-#: Function from the environment to the zone of each row's agent, (B,) integers from 0, -1 for none.
-ZoneFunction = Callable[[VecEnv], npt.ArrayLike]
-#: None uses the environment's attribute; False disables zones.
-Zones = ZoneFunction | Literal[False] | None
 
 
 class ReturnScale(NamedTuple):
@@ -228,38 +224,10 @@ class ReturnScale(NamedTuple):
     best: float | None
 
 
-def zone_function(env: VecEnv, zones: Zones) -> ZoneFunction | None:
-    """
-    Return the function for the zones of rows; None if there are none.
-
-    :raises ValueError: if ``zones`` is neither None, False nor a function
-    """
-    if zones is not None and zones is not False and not callable(zones):
-        raise ValueError(
-            "zones must be a function from the environment to the zone of each row, None to ask the environment for "
-            f"its attribute agent_zones, or False for no zones; got {zones!r}"
-        )
-    if zones is None:
-        return zones_by_attribute if env.has_attr("agent_zones") else None
-    return zones or None
-
-
 def zones_by_attribute(env: VecEnv) -> Ints:
     """Return the games' attribute ``agent_zones``, (B,)."""
     of_games = env.get_attr("agent_zones", indices=range(0, env.num_envs, require_n_agents(env)))
     return np.concatenate([np.asarray(zones, dtype=np.int64) for zones in of_games])
-
-
-def zones_now(zones: ZoneFunction, env: VecEnv) -> Ints:
-    """Return the zone of each row, (B,); ValueError if they are not (B,) integers of at least -1."""
-    rows = np.asarray(zones(env))
-    if rows.shape != (env.num_envs,) or rows.dtype.kind not in "iu" or (rows < -1).any():
-        raise ValueError(
-            f"expected zones to give whole numbers from 0 (or -1 for no zone) of shape ({env.num_envs},), one for each "
-            f"row, got shape {rows.shape} and dtype {rows.dtype}"
-            + (f" with {rows.min()}" if rows.dtype.kind == "i" and rows.size else "")
-        )
-    return rows.astype(np.int64)
 
 
 def zone_colours(env: VecEnv) -> list[tuple[float, float, float]] | None:
@@ -357,7 +325,6 @@ def record_episodes(
     deterministic: bool = False,
     *,
     gamma: float = 1.0,
-    zones: Zones = None,
     normalizer: VecNormalize | None = None,
     observations: bool = True,
     pictures: bool = True,
@@ -368,7 +335,6 @@ def record_episodes(
     Episodes are divided over the games as in ``evaluate_team``.
 
     :param deterministic: whether the policy takes its most likely actions
-    :param zones: as in :class:`~sb3_saf.InspectionCallback`
     :param normalizer: normaliser of the critic's rewards; None for raw rewards
     :param observations: whether to record the agents' own observations
     :param pictures: whether to draw the first game, if its render mode allows it
@@ -385,7 +351,7 @@ def record_episodes(
     try:
         with own_randomness(seed, ours.device):
             env.seed(seed)
-            recorder.play(n_eval_episodes, zone_function(env, zones), draws)
+            recorder.play(n_eval_episodes, draws)
     finally:
         ours.set_training_mode(was_training)
     return recorder.recording(gamma)
@@ -407,17 +373,18 @@ class _Recorder:
         self.columns: dict[str, list[npt.NDArray[Any]]] = defaultdict(list)
         self.without: dict[Replacement, list[Floats]] = defaultdict(list)
 
-    def play(self, n_episodes: int, zones: ZoneFunction | None, draws: bool) -> None:
+    def play(self, n_episodes: int, draws: bool) -> None:
         """Play episodes, and collect the results of every step."""
         policy = self.reader.policy
         asks_for_masks = isinstance(policy, TeamMaskablePolicy) and is_masking_supported(self.env)
+        has_zones = self.env.has_attr("agent_zones")
         is_first = draws and n_episodes >= len(self.lengths_now)  # else the first game may count no episode
 
         def act(obs: Any, starts: Bools) -> npt.NDArray[Any]:
             if is_first and (frame := picture(self.env)) is not None:
                 self.pictures.append(frame)
-            if zones is not None:
-                self.columns["zones"].append(zones_now(zones, self.env))
+            if has_zones:
+                self.columns["zones"].append(zones_by_attribute(self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None
             tensors: Any = policy.obs_to_tensor(obs)[0]
             reading = self.reader.step(tensors, starts, masks)

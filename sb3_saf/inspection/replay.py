@@ -7,30 +7,26 @@ Letters: T game steps, N agents, A actions, U policies, L slots.
 from __future__ import annotations
 
 import base64
-import copy
 import json
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_saf.evaluation import check_trained_on, play
-from sb3_saf.export.act import Actor
+from sb3_saf.evaluation import check_trained_on
 from sb3_saf.inspection.figures import png
-from sb3_saf.inspection.recording import EpisodeRecording, Picture, picture, record_episodes
+from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTION_MASK_KEY, EPISODE_START_KEY, OBS_KEY, TeamSpaces
-from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents, share_of_sum
+from sb3_saf.teams.rows import TeamSpaces
+from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents
 
 #: Maximum game steps of an episode; longer ones are cut, with a note on the page.
 MAX_STEPS: Final = 2000
@@ -38,19 +34,8 @@ MAX_STEPS: Final = 2000
 _SHARE: Final = 65535
 _KINDS: Final = {"u1": np.uint8, "u2": np.uint16, "i2": np.int16, "f4": np.float32}
 
-Player: TypeAlias = "BaseAlgorithm | BasePolicy | Actor"
+Player: TypeAlias = "BaseAlgorithm | BasePolicy"
 Packed = dict[str, Any]
-
-
-class _Episode(NamedTuple):
-    """One episode of one game: T steps of N agents, pictures if the game draws them, and further data of the page."""
-
-    actions: npt.NDArray[Any]
-    rewards: npt.NDArray[np.float64]
-    observations: npt.NDArray[Any]
-    frames: list[Picture]
-    arrays: dict[str, Packed | None]
-    of_team: bool = False
 
 
 def replay(
@@ -67,11 +52,10 @@ def replay(
     Play episodes and write a page that shows them agent by agent, offline and without a server.
 
     Models of SAF, MAPPO, IPPO and QPLEX are shown with action probabilities, pool, knowledge source and values, as far
-    as they have them. Exported actors are shown with own observations and actions. HECOGrid is drawn from its state,
-    other games from pictures, one before each step: the last state has none, since games begin again at once.
+    as they have them. HECOGrid is drawn from its state, other games from pictures, one before each step: the last state
+    has none, since games begin again at once.
 
-    :param model: a trained model, its policy, an exported :class:`~sb3_saf.Actor`, or several by name, shown side by
-        side
+    :param model: a trained model, its policy, or several by name, shown side by side
     :param env: from ``make_team_env``, with at least ``episodes`` games; HECOGrid needs no render mode, others
         ``render_mode="rgb_array"``
     :param path: path of the page
@@ -103,35 +87,34 @@ def replay(
     grid: Packed | None = None
     atlas = getattr(TeamSpaces.from_observation_space(env.observation_space).own, "atlas", None)
     for name, player in players.items():
-        if not isinstance(player, Actor):  # which checks every observation
-            check_trained_on(player, env, name, same_size=True)
-        if isinstance(player, Actor):
-            played = _play_actor(player, env, episodes, seed, deterministic)
-        else:
-            policy = player.policy if isinstance(player, BaseAlgorithm) else player
-            given = gamma[name] if isinstance(gamma, Mapping) else gamma
-            discount = float(getattr(player, "gamma", 1.0)) if given is None else given
-            recording = record_episodes(
-                *(policy, env, env.num_envs // n_agents, seed, deterministic),
-                gamma=discount,
-                normalizer=player.get_vec_normalize_env() if isinstance(player, BaseAlgorithm) else normalizer,
-            )
-            played = [_episode_of(recording, game) for game in range(episodes)]
-        for game, episode in enumerate(played):
-            pictures = [base64.b64encode(png(frame)).decode() for frame in episode.frames]
+        check_trained_on(player, env, name, same_size=True)
+        policy = player.policy if isinstance(player, BaseAlgorithm) else player
+        given = gamma[name] if isinstance(gamma, Mapping) else gamma
+        discount = float(getattr(player, "gamma", 1.0)) if given is None else given
+        recording = record_episodes(
+            *(policy, env, env.num_envs // n_agents, seed, deterministic),
+            gamma=discount,
+            normalizer=player.get_vec_normalize_env() if isinstance(player, BaseAlgorithm) else normalizer,
+        )
+        for game in range(episodes):
+            rows = slice(game * n_agents, (game + 1) * n_agents)
+            ended = recording.ends[:, rows].all(axis=1)
+            steps = slice(0, min(int(np.flatnonzero(ended)[0]) + 1, MAX_STEPS))
+            frames = [] if has_grid else [base64.b64encode(png(one)).decode() for one in recording.pictures[steps]]
             run: Packed = {
                 "name": name if episodes == 1 else f"{name}, game {game + 1}",
-                "steps": len(episode.actions),
-                "rewards": _packed(episode.rewards, "f4"),
-                "frames": None if has_grid else [f"data:image/png;base64,{picture}" for picture in pictures],
+                "steps": steps.stop,
+                "rewards": _packed(recording.team_rewards[steps, game], "f4"),
+                "frames": None if has_grid else [f"data:image/png;base64,{frame}" for frame in frames],
             }
             if has_grid:
-                scenes, grid = _played_again(episode.actions, env, game, seed)
+                scenes, grid = _played_again(recording.actions[steps, rows], env, game, seed)
                 run |= scenes
-            run["of_team"] = episode.of_team
+            run["of_team"] = recording.of_team
             if atlas is not None:
-                run["views"] = _packed(episode.observations, "u1")
-            runs.append(run | {key: value for key, value in episode.arrays.items() if value is not None})
+                assert recording.observations is not None
+                run["views"] = _packed(recording.observations[steps, rows], "u1")
+            runs.append(run | _outputs(recording, game, rows, steps))
     n_actions = int(env.action_space.n) if isinstance(env.action_space, spaces.Discrete) else 0
     names = env.get_attr("action_names", indices=[0])[0] if env.has_attr("action_names") else range(n_actions)
     cut = any(run["steps"] == MAX_STEPS for run in runs)
@@ -145,12 +128,7 @@ def replay(
         "runs": runs,
         "note": f"Cut after {MAX_STEPS:,} game steps." if cut else note,
     }
-    kinds = {
-        "exported actor"
-        if isinstance(player, Actor)
-        else type(getattr(player, "policy", player)).__name__.removesuffix("Policy")
-        for player in players.values()
-    }
+    kinds = {type(getattr(player, "policy", player)).__name__.removesuffix("Policy") for player in players.values()}
     folder = files("sb3_saf.inspection")
     page = folder.joinpath("replay.html").read_text(encoding="utf-8")
     for mark, content in (
@@ -166,73 +144,24 @@ def replay(
     return target
 
 
-def _episode_of(recording: EpisodeRecording, game: int) -> _Episode:
-    """Return the first episode of a game, at most ``MAX_STEPS`` long."""
-    n = recording.n_agents
-    rows = slice(game * n, (game + 1) * n)
-    ended = recording.ends[:, rows].all(axis=1)
-    steps = slice(0, min(int(np.flatnonzero(ended)[0]) + 1, MAX_STEPS))
+def _outputs(recording: EpisodeRecording, game: int, rows: slice, steps: slice) -> Packed:
+    """Return actions and what the policy computed, as far as it has it."""
 
     def share(values: npt.NDArray[Any] | None, columns: slice | int) -> Packed | None:
         return None if values is None else _packed(values[steps, columns] * _SHARE, "u2", 1 / _SHARE)
 
-    assert recording.observations is not None
     zero = recording.values_without.get("zero")
-    actions = recording.actions[steps, rows]
-    return _Episode(
-        actions,
-        recording.team_rewards[steps, game],
-        recording.observations[steps, rows],
-        recording.pictures[steps] if game == 0 else [],
-        {
-            "actions": _packed(actions, "u2") if recording.actions.ndim == 2 else None,
-            "probabilities": share(recording.action_probabilities, rows),
-            "weights": share(recording.pool_weights, rows),
-            "read": share(recording.read_attention, game),
-            "write": share(recording.write_attention, game),
-            "values": _packed(recording.values[steps, rows], "f4"),
-            "returns": _packed(recording.returns[steps, rows], "f4"),
-            "message": None if zero is None else _packed((zero - recording.values)[steps, rows], "f4"),
-        },
-        recording.of_team,
-    )
-
-
-def _play_actor(actor: Actor, env: VecEnv, episodes: int, seed: int, deterministic: bool) -> list[_Episode]:
-    """Play one episode of each game with an exported actor, on own observations and masks."""
-    n_agents = require_n_agents(env)
-    frames: list[Picture] = []
-    actors = [copy.copy(actor) for _ in range(n_agents)]
-    memories = [actor.new_memory() if actor.has_memory else None for _ in range(n_agents)]
-    for index, one in enumerate(actors):
-        one.agent = index
-
-    def act(obs: Any, starts: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
-        if env.render_mode == "rgb_array" and (frame := picture(env)) is not None:
-            frames.append(frame)
-        masks, actions = obs.get(ACTION_MASK_KEY), []
-        for index, (one, memory) in enumerate(zip(actors, memories, strict=True)):
-            rows = slice(index, None, n_agents)
-            for state in () if memory is None else memory.states.values():  # also where agents join
-                state[obs[EPISODE_START_KEY][rows].astype(bool).reshape(-1)] = 0
-            mask = None if masks is None else masks[rows]
-            actions.append(one.act(obs[OBS_KEY][rows], deterministic, action_mask=mask, memory=memory))
-        return np.stack(actions, axis=1).reshape(env.num_envs, *(env.action_space.shape or ()))
-
-    with own_randomness(seed, th.device("cpu")):
-        env.seed(seed)
-        steps = list(play(env, act, env.num_envs // n_agents))
-    played = []
-    for game in range(episodes):
-        rows = slice(game * n_agents, (game + 1) * n_agents)
-        length = next(number for number, step in enumerate(steps, 1) if step.ended[game])
-        episode = steps[: min(length, MAX_STEPS)]
-        actions = np.stack([step.actions[rows] for step in episode])
-        rewards = np.array([float(step.rewards[rows].sum()) for step in episode]) * share_of_sum(env)
-        observations = np.stack([step.observations[OBS_KEY][rows] for step in episode])
-        pictures = frames[: len(episode)] if game == 0 else []
-        played.append(_Episode(actions, rewards, observations, pictures, {"actions": _packed(actions, "u1")}))
-    return played
+    arrays = {
+        "actions": _packed(recording.actions[steps, rows], "u2") if recording.actions.ndim == 2 else None,
+        "probabilities": share(recording.action_probabilities, rows),
+        "weights": share(recording.pool_weights, rows),
+        "read": share(recording.read_attention, game),
+        "write": share(recording.write_attention, game),
+        "values": _packed(recording.values[steps, rows], "f4"),
+        "returns": _packed(recording.returns[steps, rows], "f4"),
+        "message": None if zero is None else _packed((zero - recording.values)[steps, rows], "f4"),
+    }
+    return {name: array for name, array in arrays.items() if array is not None}
 
 
 def _played_again(actions: npt.NDArray[Any], env: VecEnv, game: int, seed: int) -> tuple[Packed, Packed]:

@@ -59,7 +59,6 @@ def make_parser() -> argparse.ArgumentParser:
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="the model with the best evaluation")
     which.add_argument("--load-checkpoint", metavar="STEPS", type=int, help="the model saved after these game steps")
-    which.add_argument("--load-last-checkpoint", action="store_true", help="the model that was saved last on the way")
     parser.add_argument("--episodes", type=at_least(1), default=32, help="team episodes to measure")
     parser.add_argument("--deterministic", action="store_true", help="most likely actions; else they are drawn")
     parser.add_argument(
@@ -82,7 +81,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
         if options.team is None:
             find_algorithm(options.algo)
             environment = find_environment(options.env)
-            which = "best" if options.load_best else "last" if options.load_last_checkpoint else options.load_checkpoint
+            which = "best" if options.load_best else options.load_checkpoint
             run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
         else:
             run = find_team(options.team)

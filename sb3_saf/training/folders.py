@@ -1,25 +1,6 @@
 """
-Folder of a run, of ``sb3_saf.train`` and of the cells of experiments: one writer, one reader, one list of its files.
-
-    run.json         settings, seed, options, command, versions; written first
-    monitor.csv      one line per team episode
-    NAME.zip         the model; best_model.zip, rl_model_STEPS_steps.zip, evaluations.npz beside it
-    checkpoints/     until the run is finished
-    curve.csv        learning curve: means over the training episodes
-    finished.json    cost, and the digests of the files; written last
-
-``sb3_saf.train`` numbers its runs as RL-Zoo3 does, ``FOLDER/ALGO/NAME_NUMBER`` (NAME is the environment's name in file
-names), and RL-Zoo3's plots can read them.
-
-A published team is such a folder with plain data only, which anybody can play:
-
-    trained_teams/TeamSupport-c2-h1/saf/
-        run.json             settings, seed, versions; ``row``: the row of its table, with the return of each test game
-        weights.safetensors  the best policy by the evaluations
-        replay.html          one episode, if the game is drawn from its state and the page is small
-        finished.json        cost, and the digests of these files
-
-``python -m sb3_saf.experiments publish`` writes them, ``python -m sb3_saf.experiments teams`` checks them.
+Folders of runs and of published teams (``docs/zoo.md``, "Output of a run" and "Trained teams"): one writer, one reader,
+one list of their files.
 """
 
 from __future__ import annotations
@@ -365,7 +346,7 @@ def find_model(
     Find a trained model.
 
     :param number: number of the run; 0 for the latest
-    :param which: None for the final model, "best", "last" for the last saved one, or the game steps of a saved one
+    :param which: None for the final model, "best", or the game steps of a saved one
     :return: the run, and the model's file
     :raises ValueError: if there is none, with a fix
     """
@@ -379,17 +360,11 @@ def find_model(
     if number and number not in runs:
         raise ValueError(f"there is no run {number} of {environment.id} in {log_folder / algo}; there are {[*runs]}")
     folder = runs[number or max(runs)]
-    if which == "last":
-        saved = [(int(match[1]), path) for path in folder.iterdir() if (match := SAVED_MODEL.fullmatch(path.name))]
-        path = max(saved)[1] if saved else None
-    elif which == "best":
-        path = folder / "best_model.zip"
-    else:
-        path = folder / (f"{name}.zip" if which is None else f"rl_model_{which}_steps.zip")
-    if path is None or not path.is_file():
+    names: dict[object, str] = {None: f"{name}.zip", "best": "best_model.zip"}
+    path = folder / names.get(which, f"rl_model_{which}_steps.zip")
+    if not path.is_file():
         raise ValueError(
-            f"{folder} has no {'saved model' if path is None else path.name}; --save-freq and --eval-freq of "
-            "sb3_saf.train save models on the way"
+            f"{folder} has no {path.name}; --save-freq and --eval-freq of sb3_saf.train save models on the way"
         )
     return Run(folder), path
 

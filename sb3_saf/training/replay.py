@@ -10,7 +10,6 @@ from typing import Any, Final
 
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_saf.export.act import Actor
 from sb3_saf.inspection.replay import replay
 from sb3_saf.teams.checks import ExportError, check_seed, evaluation_seed
 from sb3_saf.training.commands import (
@@ -42,7 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="+",
         required=True,
         metavar="FILE",
-        help="a model (.zip), or the folder of a published team or of exported actors; several are shown side by side",
+        help="a model (.zip), or the folder of a published team; several are shown side by side",
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("replay.html"), help="the page")
     add_environment_options(parser, "another level than was trained on, such as coordination:3")
@@ -61,7 +60,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
     import_packages(options.gym_packages)
     with user_errors(ValueError, OSError, ExportError):
         seed = evaluation_seed(check_seed(options.seed))
-        paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in options.model]
+        models = list(dict.fromkeys(options.model))
+        paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
         settings = [_settings_of(path, options) for path in paths]
         suite = settings[0].environment.suite
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
@@ -69,8 +69,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
         ) as games:
             players: dict[str, Any] = {
-                name: Actor.load(path) if path.is_dir() else make_policy(own, path, games)
-                for name, path, own in zip(_names(options.model), paths, settings, strict=True)
+                name: make_policy(own, path, games)
+                for name, path, own in zip(_names(models), paths, settings, strict=True)
             }
             if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
                 raise ValueError("a model with normalize is shown alone: its games are normalised with its statistics")
@@ -97,13 +97,9 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return distinct names of models: file names, with folders and numbers if necessary."""
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{path.parent.name}/{path.stem}" for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{number}: {name}" for number, name in enumerate(names, 1)]
-    return names
+    """Return distinct names of models: file names, or paths where these are equal."""
+    stems = [path.stem for path in paths]
+    return [stem if stems.count(stem) == 1 else str(path) for path, stem in zip(paths, stems, strict=True)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

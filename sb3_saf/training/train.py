@@ -149,22 +149,12 @@ def _add_tuning(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--study-name", help="name of the study in the storage")
     group.add_argument("--trial-id", help="train with the settings of this trial of the study, a number or 'best'")
     group.add_argument("--n-trials", type=at_least(1), default=100, help="trials of this process")
-    group.add_argument("--max-total-trials", type=at_least(1), help="trials of all processes together")
     group.add_argument(
         "--n-startup-trials", type=at_least(0), default=10, help="random trials before the sampler learns"
     )
     group.add_argument("--n-evaluations", type=at_least(1), default=5, help="evaluations of a trial")
-    group.add_argument(
-        "--n-jobs",
-        type=at_least(1, -1),
-        default=1,
-        help="trials at once in threads, which share random numbers; better: processes",
-    )
     group.add_argument("--sampler", choices=["random", "tpe"], default="tpe", help="Optuna's sampler")
     group.add_argument("--pruner", choices=["halving", "median", "none"], default="median", help="Optuna's pruner")
-    group.add_argument(
-        "--optimization-log-path", type=Path, help="folder for evaluations and best model of every trial"
-    )
 
 
 def train(arguments: Sequence[str] | None = None) -> None:
@@ -347,13 +337,10 @@ def _tune(options: argparse.Namespace, command: str) -> None:
         settings, eval_settings = _settings(options)
         run_options = _run_options(options, settings, eval_settings=eval_settings)
     quiet = replace(run_options, eval_freq=0, tensorboard_log=None, progress=False, verbose=0)
-    keys = ("storage", "study_name", "n_trials", "max_total_trials", "n_jobs", "sampler", "pruner")
+    keys = ("storage", "study_name", "n_trials", "sampler", "pruner", "n_startup_trials", "n_evaluations")
     tuning = Tuning(
         seed=secrets.randbelow(MAX_SEED) if options.seed == -1 else options.seed,
         options=quiet,
-        log_path=options.optimization_log_path,
-        n_startup_trials=options.n_startup_trials,
-        n_evaluations=options.n_evaluations,
         **{key: getattr(options, key) for key in keys},
     )
     evaluated = {name: getattr(options, name) for name in ("eval_env_kwargs", "eval_episodes", "deterministic_eval")}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -13,10 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import optuna
-import psutil
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.study import MaxTrialsCallback
 from optuna.trial import TrialState
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -26,13 +22,9 @@ from sb3_saf.teams.files import differences
 from sb3_saf.training.run import RunOptions, SeededEvalCallback, Training
 from sb3_saf.training.settings import Settings, algorithm_arguments
 
-#: Trials that count for ``max_total_trials``; includes running ones, so that workers do not exceed it.
-_COUNTED: Final = (TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED)
 _SQLITE: Final = "sqlite:///"
 _JOURNAL: Final = ".log"
 _ATTEMPTS: Final = 10
-#: Attribute of a trial: host and number of its process.
-_PROCESS: Final = "process"
 #: Attribute of a trial: what ended it.
 _ERROR: Final = "error"
 
@@ -133,8 +125,6 @@ class Tuning:
     :param storage: see :func:`open_storage`; None keeps the study in memory
     :param study_name: None for a name chosen by Optuna
     :param n_trials: trials of this process
-    :param max_total_trials: trials of all processes together, instead of ``n_trials``
-    :param log_path: folder for evaluations, models and monitor of every trial; None for none
     """
 
     seed: int
@@ -142,13 +132,10 @@ class Tuning:
     storage: str | None = None
     study_name: str | None = None
     n_trials: int = 100
-    max_total_trials: int | None = None
-    n_jobs: int = 1
     sampler: str = "tpe"
     pruner: str = "median"
     n_startup_trials: int = 10
     n_evaluations: int = 5
-    log_path: Path | None = None
 
 
 def optimize(
@@ -181,23 +168,8 @@ def optimize(
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
         study.set_user_attr("goal", goal)
-    # Trials of killed processes of this machine would stay RUNNING and count for ever.
-    for dead in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        host, process = dead.user_attrs.get(_PROCESS, ("", 0))
-        if host == socket.gethostname() and not psutil.pid_exists(process):
-            study.tell(dead.number, state=TrialState.FAIL)
-    callbacks: list[MaxTrialsCallback] = []
-    n_trials: int | None = tuning.n_trials
-    if tuning.max_total_trials is not None:
-        if len(study.get_trials(deepcopy=False, states=_COUNTED)) >= tuning.max_total_trials:
-            return study
-        callbacks, n_trials = [MaxTrialsCallback(tuning.max_total_trials, states=_COUNTED)], None
     study.optimize(
-        lambda trial: run_trial(trial, settings_of(trial), tuning),
-        n_trials=n_trials,
-        n_jobs=tuning.n_jobs,
-        callbacks=callbacks,
-        gc_after_trial=True,
+        lambda trial: run_trial(trial, settings_of(trial), tuning), n_trials=tuning.n_trials, gc_after_trial=True
     )
     trials = study.get_trials(deepcopy=False)
     if all(trial.state is not TrialState.COMPLETE for trial in trials):
@@ -212,9 +184,7 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
 
     :raises optuna.TrialPruned: if the pruner stops it, training fails, or the value is not finite
     """
-    trial.set_user_attr(_PROCESS, (socket.gethostname(), os.getpid()))
     seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
-    folder = None if tuning.log_path is None else tuning.log_path / f"trial_{trial.number}"
     report = TrialReport(trial)
     options = replace(
         tuning.options,
@@ -223,7 +193,7 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
         checkpoint_freq=0,
     )
     try:
-        with closing(Training(settings, seed, folder, options)) as training:
+        with closing(Training(settings, seed, options=options)) as training:
             training.learn()
     except (AssertionError, ValueError) as error:  # sampled settings may lead to NaN
         trial.set_user_attr(_ERROR, str(error))
