@@ -288,6 +288,13 @@ def _check_fits(training_env: VecEnv, eval_env: VecEnv) -> None:
             "eval_env is the training environment; inspections would play on its games: make another one, for instance "
             "with sb3_saf.make_team_env and a seed of its own"
         )
+    for name in ("observation_space", "action_space"):
+        of_training, of_eval = getattr(training_env, name), getattr(eval_env, name)
+        if of_training != of_eval:
+            raise ValueError(
+                f"expected eval_env to have the {name} of the training environment, {of_training}, got {of_eval}; make "
+                "both with the same arguments"
+            )
     limits = [
         next((layer.time_limit for layer in layers(env) if isinstance(layer, CentralizedValueWrapper)), None)
         for env in (training_env, eval_env)
