@@ -190,6 +190,7 @@ class Bounded(Game):
         )
 
 
+@pytest.mark.filterwarnings("ignore:expected Box actions around 0")
 def test_a_random_policy_of_an_environment() -> None:
     env = make_team_env(CounterEnv, n_envs=2, seed=0)
     of_space, of_env, of_game = (RandomPolicy(source, seed=3) for source in (env.action_space, env, CounterEnv()))
