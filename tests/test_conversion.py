@@ -119,6 +119,18 @@ def make(algorithm: Any, policy: str, env: Any, **kwargs: Any) -> Any:
     return algorithm(policy, env, **settings, seed=0)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_actions_of_the_game_become_those_of_rows_and_back(kind: str) -> None:
+    env = make_team_env(partial(Kinds, kind), seed=0)
+    agents: Any = env.observation_space["agent"]  # type: ignore[index]
+    for conversion, (_, space) in zip(agents.conversions, KINDS[kind], strict=True):
+        space.seed(0)
+        for action in (space.sample() for _ in range(20)):
+            row = conversion.row_action_of(action)
+            assert row.shape == env.action_space.shape
+            np.testing.assert_array_equal(conversion.game_action(row), action)
+
+
 @pytest.mark.parametrize("masks", [None, "info", "observation"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: Path) -> None:

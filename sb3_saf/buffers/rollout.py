@@ -456,7 +456,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             V_t = r_t + gamma (1 - b_{t+1}) V_{t+1}
 
         So an absence is no end, rewards paid to an agent that waits or has ended count for its last action, and V is
-        zero after its end if nothing is paid. V_T is zero for inactive agents. Advantages of inactive rows are unused.
+        zero after its end if nothing is paid. V_T is zero for inactive agents. Advantages of inactive rows are unused;
+        their values and returns become the means of the active ones, which leaves SB3's explained variance to these.
 
         With ``ends="team"``, V of an inactive agent is the mean of V over the active agents of its team, since all
         receive the same reward.
