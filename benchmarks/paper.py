@@ -121,7 +121,7 @@ def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> l
     """Return the claims that these data can test."""
     general = 'SAF is better than {} "across different tasks and different heterogeneity and coordination levels"'
     everywhere = "all games"
-    hidden, pixels = "TeamSupport, h = 5, zones as pixels", pixels[pixels["level"] == "c1-h5"]
+    hidden, pixels = "TeamSupport, h = 5, zones as pixels", pixels.query("task == 'TeamSupport' and level == 'c1-h5'")
     coordinated, zones = tests[tests["coordination"] > 1], tests[tests["heterogeneity"] > 1]
     return [
         Claim(general.format("MAPPO"), ("saf", "mappo"), everywhere, tests),
