@@ -94,7 +94,8 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         # The same object in every call: seeding a space must affect later calls.
         self.observation_spaces = dict.fromkeys(self.possible_agents, own_space)
         self.action_spaces = {agent: spaces.Discrete(N_ACTIONS) for agent in self.possible_agents}
-        self.state_space = spaces.Box(0, 255, (size, size, len(STATE_PLANES)), np.uint8)
+        # Floats with a bound that no count reaches: up to 1 or 255 libraries take them for a picture.
+        self.state_space = spaces.Box(0, 2**16, (size, size, len(STATE_PLANES)), np.float32)
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the space of an agent's observation."""
@@ -179,7 +180,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
         """Return the present views of all agents, also after :meth:`set_state`."""
         return dict(zip(self.possible_agents, self._batch.observe_game(self._game), strict=True))
 
-    def state(self) -> npt.NDArray[np.uint8]:
+    def state(self) -> npt.NDArray[np.float32]:
         """Return the central view: (W, H, 10), planes as in :data:`hecogrid_envs.state.STATE_PLANES`."""
         return central_view(self.get_state(), self.params.zone_of_column())
 

@@ -150,21 +150,21 @@ def _first(where: Bools) -> tuple[int, ...]:
     return tuple(int(i) for i in np.argwhere(where)[0])
 
 
-def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+def central_view(state: StateMapping, zone_of_column: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:
     """
     Encode the whole game in planes, for a centralised critic.
 
     :param zone_of_column: (W,)
-    :return: (W, H, 10) uint8, planes as in :data:`STATE_PLANES`; counts stop at 255
+    :return: (W, H, 10) float32, planes as in :data:`STATE_PLANES`
     """
     width, height = state["walls"].shape
-    counts = np.zeros((width, height, len(STATE_PLANES)), dtype=np.int64)
+    counts = np.zeros((width, height, len(STATE_PLANES)), dtype=np.float32)
     counts[..., 0] = state["walls"]
     counts[..., 1] = state["treasures"] == TreasureState.AVAILABLE
     counts[..., 2] = state["treasures"] == TreasureState.COLLECTED
     counts[..., 3] = state["keys"]
     x, y = state["agent_pos"].T
     np.add.at(counts, (x, y, 4 + state["agent_dir"]), 1)
-    np.add.at(counts, (x, y, np.full_like(x, 8)), state["agent_has_key"].astype(np.int64))
+    np.add.at(counts, (x, y, np.full_like(x, 8)), state["agent_has_key"])
     counts[..., 9] = zone_of_column[:, None]
-    return np.minimum(counts, 255).astype(np.uint8)
+    return counts

@@ -95,7 +95,7 @@ to arrive.
 
 ## State
 
-`state()` is the whole game in planes, (W, H, 10) uint8. `get_state()` and `set_state(mapping)`, also
+`state()` is the whole game in planes, (W, H, 10) float32. `get_state()` and `set_state(mapping)`, also
 `reset(options={"state": mapping})`, use plain arrays: `walls` (W, H), `treasures` (W, H) with 0 none, 1 available,
 2 collected, `keys` (W, H), `agent_pos` (N, 2) as x, y, `agent_dir` (N,), `agent_has_key` (N,).
 

@@ -14,7 +14,9 @@ from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
+from hecogrid_envs.state import STATE_PLANES
 from sb3_saf import QPLEX, GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import evaluate_team
@@ -86,7 +88,14 @@ def test_wrong_calls(make: Callable[[], VecEnv], named: str) -> None:
 def test_hecogrid_through_supersuit_has_the_games_state_and_signals() -> None:
     env = make_team_env("TeamTogether", 2, backend="supersuit", state=True, active=True, **SMALL)
     assert env.team_spaces.state is not None and env.team_spaces.has_active
-    assert env.reset()["state"].shape[0] == env.num_envs
+    rows: Any = env.reset()
+    assert rows["state"].shape == (env.num_envs, SMALL["grid_size"], SMALL["grid_size"], len(STATE_PLANES))
+    model = PPO("MAPPOPolicy", env, policy_kwargs={"critic_input": "state"}, device="cpu")
+    read: list[Any] = []
+    first = next(layer for layer in model.policy.value_net.modules() if isinstance(layer, nn.Linear))
+    first.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0]))
+    model.policy.predict_values(model.policy.obs_to_tensor(rows)[0])
+    assert read[0].max() == rows["state"].max() >= 1, "planes are numbers, not pixels of 0 to 255"
     env.close()
 
 

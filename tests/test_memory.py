@@ -304,7 +304,7 @@ def test_two_runs_of_one_seed_end_alike_and_evaluation_between_changes_nothing()
 
 
 def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tmp_path: Any) -> None:
-    callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=1, pictures=False)
+    callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=7, pictures=False)
     plain = make_model(env=make_env((5, 5, 5))).learn(48 * 9)
     watched = make_model(env=make_env((5, 5, 5)), tensorboard_log=str(tmp_path)).learn(48 * 9, callback=callback)
     assert weights_of(plain) == weights_of(watched)
