@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchmarks import paper
+from benchmarks import paper, suite_results
 from sb3_saf.experiments.tables import CURVES, RUNS
 
 
@@ -15,6 +15,11 @@ def test_pages_of_results_equal_their_raw_data() -> None:
     for page, text in pages.items():
         assert page.read_text(encoding="utf-8") == text, f"{page}: run python -m benchmarks.paper"
     assert pages[paper.PAGES[0]].count("\n") <= 150
+
+
+def test_tables_of_predictions_can_be_read() -> None:
+    for folder in (paper.RAW, suite_results.RAW):
+        assert list(pd.read_csv(folder / "predictions.csv")) == ["block", "question", "prediction", "measured"]
 
 
 def test_curves_are_the_evaluations_of_their_runs() -> None:
