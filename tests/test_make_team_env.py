@@ -13,11 +13,21 @@ import pytest
 from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
+from supersuit import agent_indicator_v0, clip_reward_v0, frame_stack_v1
 from torch import nn
 
+import hecogrid_envs
 from hecogrid_envs.state import STATE_PLANES
-from sb3_saf import QPLEX, GameStepsCallback, RandomPolicy, TeamRolloutBuffer, make_team_env, ppo_settings
+from sb3_saf import (
+    QPLEX,
+    CentralizedValueWrapper,
+    GameStepsCallback,
+    RandomPolicy,
+    TeamRolloutBuffer,
+    make_team_env,
+    ppo_settings,
+)
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
 from sb3_saf.evaluation import evaluate_team
 from sb3_saf.training.settings import load_settings
@@ -97,6 +107,20 @@ def test_hecogrid_through_supersuit_has_the_games_state_and_signals() -> None:
     model.policy.predict_values(model.policy.obs_to_tensor(rows)[0])
     assert read[0].max() == rows["state"].max() >= 1, "planes are numbers, not pixels of 0 to 255"
     env.close()
+
+
+def test_wrappers_that_make_tile_codes_plain_numbers_are_refused() -> None:
+    def game(**params: Any) -> Any:
+        return hecogrid_envs.parallel_env("TeamSupport", **SMALL, **params)
+
+    for wrap in (lambda env: frame_stack_v1(env, 2), agent_indicator_v0):
+        with pytest.raises(ValueError, match=r"leave tile codes as they are, .* give the game observation='rgb'"):
+            make_team_env(lambda wrap=wrap: wrap(game(observation="tiles")))
+        make_team_env(lambda wrap=wrap: wrap(game())).close()
+    make_team_env(lambda: clip_reward_v0(game(observation="tiles"))).close()
+    rows = make_team_env("TeamSupport", 2, **SMALL).venv
+    with pytest.raises(ValueError, match="leave tile codes as they are"):
+        CentralizedValueWrapper(VecFrameStack(rows, 2))
 
 
 def test_short_first_episodes_of_staggered_games_do_not_count() -> None:

@@ -22,6 +22,7 @@ from sb3_saf.teams.rows import (
     STATE_KEY,
     Array,
     TeamSpaces,
+    check_codes_are_kept,
     fill_idle_rows,
     n_mask_entries,
 )
@@ -56,6 +57,8 @@ class GameReader:
         observed, acted, keys = trial.observed.values(), trial.actions, trial.mask_keys
         own_spaces = [without_mask(*entry) for entry in zip(observed, keys.values(), strict=True)]
         own = own_space(own_spaces)
+        inner = getattr(getattr(trial.env, "unwrapped", None), "observation_spaces", None)
+        check_codes_are_kept(own, inner.values() if isinstance(inner, Mapping) else ())
         if not has_pictures(own) and any(_is_picture(leaf) for space in own_spaces for _, leaf in innermost(space)):
             self.notes.append(
                 "the pictures in the agents' observations are read as plain numbers, without convolutions, because "

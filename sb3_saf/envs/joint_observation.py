@@ -34,9 +34,10 @@ from sb3_saf.teams.rows import (
     TerminalRow,
     allows_nothing,
     channels_first,
+    check_codes_are_kept,
     first_choices,
 )
-from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, chosen_indices, require_n_agents, team_dones
+from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, chosen_indices, layers, require_n_agents, team_dones
 
 TimeLimit = Literal["terminal", "bootstrap"]
 
@@ -90,6 +91,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         names = getattr(venv, "possible_agents", None)
         names = tuple(names) if names is not None and len(names) == n_agents else None
         raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
+        below = (layer.observation_space for layer in layers(venv))
+        check_codes_are_kept(raw.own, (space[OBS_KEY] if isinstance(space, spaces.Dict) else space for space in below))
         self._normalization = unwrap_vec_normalize(venv)
         raw_state = None if raw.state is None else self._normalized(raw.state, STATE_KEY)
         raw = replace(raw, own=self._normalized(raw.own, OBS_KEY), state=raw_state)

@@ -379,7 +379,7 @@ def aggregates(experiment: Experiment, table: pd.DataFrame) -> str:
     """Return interquartile means over the tasks, for each level and over all levels."""
     common = complete(strata(experiment, table))
     if common.empty:
-        return "## Aggregates\n\nNone yet: the methods have no seed in common on the same settings."
+        return "## Aggregates\n\nNone yet: no seed was run by all methods on all of their common settings."
     of_treasures = common["max_return"].notna().all()
     what = (
         "the share of treasures collected"

@@ -359,6 +359,23 @@ def _not_a_team_space(found: str) -> str:
     )
 
 
+def check_codes_are_kept(seen: spaces.Space[Any], inner: Iterable[spaces.Space[Any]]) -> None:
+    """
+    Check that wrappers leave tile codes alone: without their atlas encoders would read codes as magnitudes.
+
+    :param seen: own observations behind the wrappers
+    :param inner: own observations of what they wrap
+    :raises ValueError: if an inner space has an ``atlas``, and the outer one its codes without it
+    """
+    if not isinstance(seen, spaces.Box) or hasattr(seen, "atlas"):
+        return
+    if any(hasattr(space, "atlas") and space.high.max() == seen.high.max() for space in inner):  # type: ignore[attr-defined]
+        raise ValueError(
+            f"expected wrappers that leave tile codes as they are, got {seen} without their atlas; give the game "
+            "observation='rgb', or leave the wrapper out"
+        )
+
+
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
     """
     Return a space with channels first for channel-last images, else the same object.

@@ -345,8 +345,6 @@ def _build(
     wrapping = {key: own[key] for key in WRAPPER_KEYS if key in own}
     if wrapping.get("normalize", False) is not False and issubclass(spec.algorithm, OffPolicyAlgorithm):
         raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {algo}")
-    if "frame_stack" in wrapping and env_kwargs.get("observation") == "tiles":
-        raise ValueError("frame_stack stacks pictures, not tile codes; give the game observation: rgb in env_kwargs")
     n_envs, game_steps = own.get("n_envs", 1), convert("game_steps", own.get("game_steps"), int)
     for stage in stages_of(wrapping, game_steps):
         environment.complete({**env_kwargs, **stage.params})
