@@ -13,7 +13,7 @@ import pytest
 from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, VecFrameStack
 from supersuit import agent_indicator_v0, clip_reward_v0, frame_stack_v1
 from torch import nn
 
@@ -121,6 +121,9 @@ def test_wrappers_that_make_tile_codes_plain_numbers_are_refused() -> None:
     rows = make_team_env("TeamSupport", 2, **SMALL).venv
     with pytest.raises(ValueError, match="leave tile codes as they are"):
         CentralizedValueWrapper(VecFrameStack(rows, 2))
+    renamed = TeamVenv(n_agents=2)
+    renamed.observation_space = spaces.Dict({"seen": renamed.observation_space})
+    CentralizedValueWrapper(VecExtractDictObs(renamed, "seen"), n_agents=2)
 
 
 def test_short_first_episodes_of_staggered_games_do_not_count() -> None:

@@ -92,7 +92,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         names = tuple(names) if names is not None and len(names) == n_agents else None
         raw = TeamSpaces.of_rows(venv.observation_space, venv.action_space, n_agents, names)
         below = (layer.observation_space for layer in layers(venv))
-        check_codes_are_kept(raw.own, (space[OBS_KEY] if isinstance(space, spaces.Dict) else space for space in below))
+        own_below = (space.get(OBS_KEY, space) if isinstance(space, spaces.Dict) else space for space in below)
+        check_codes_are_kept(raw.own, own_below)
         self._normalization = unwrap_vec_normalize(venv)
         raw_state = None if raw.state is None else self._normalized(raw.state, STATE_KEY)
         raw = replace(raw, own=self._normalized(raw.own, OBS_KEY), state=raw_state)

@@ -369,7 +369,8 @@ def check_codes_are_kept(seen: spaces.Space[Any], inner: Iterable[spaces.Space[A
     """
     if not isinstance(seen, spaces.Box) or hasattr(seen, "atlas"):
         return
-    if any(hasattr(space, "atlas") and space.high.max() == seen.high.max() for space in inner):  # type: ignore[attr-defined]
+    coded = (space for space in inner if isinstance(space, spaces.Box) and hasattr(space, "atlas"))
+    if any(space.high.max() == seen.high.max() for space in coded):
         raise ValueError(
             f"expected wrappers that leave tile codes as they are, got {seen} without their atlas; give the game "
             "observation='rgb', or leave the wrapper out"
