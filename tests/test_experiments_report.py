@@ -197,15 +197,16 @@ def test_published_results_are_drawn_beside_ones_own(folder: Path, tmp_path: Pat
         path = tmp_path / "published" / "coordination" / name
         pd.concat([table, others, longer, larger]).to_csv(path, index=False)
     mine = shutil.copytree(folder, tmp_path / "mine")
-    page = report(mine, "--beside", str(tmp_path / "published"))
+    words = ("--tasks", "TeamSupport", "--levels", "1", "--beside")
+    page = report(mine, *words, str(tmp_path / "published"))
     row = part_of(page, "Team return by").split("| theirs |")[1].splitlines()[0]
     assert f"| IPPO, shared |{row}" in page  # equal numbers
     assert "longer" not in page and "larger" not in page
-    assert report(mine, "--beside", str(tmp_path / "published" / "coordination")) == page
+    assert report(mine, *words, str(tmp_path / "published" / "coordination")) == page
     assert set(pd.read_csv(mine / "coordination" / "runs.csv")["method"]) == {"saf", "ippo", "random"}
     (tmp_path / "published" / "coordination" / "runs.csv").write_text("a,b\n1,2\n")
     with pytest.raises(SystemExit, match="2"):
-        report(mine, "--beside", str(tmp_path / "published"))
+        report(mine, *words, str(tmp_path / "published"))
 
 
 def test_marl_eval_gets_means_over_the_episodes_of_complete_runs(folder: Path) -> None:

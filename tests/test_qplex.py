@@ -318,15 +318,7 @@ def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
 # --- export -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("policy", "kwargs"),
-    [
-        ("QPLEXPoolPolicy", {}),
-        ("QPLEXPolicy", {"heads": "per_agent"}),
-        ("QPLEXPolicy-gru", {}),
-        ("QPLEXPoolPolicy-lstm", {}),
-    ],
-)
+@pytest.mark.parametrize(("policy", "kwargs"), [("QPLEXPolicy", {"heads": "per_agent"}), ("QPLEXPoolPolicy-lstm", {})])
 def test_exported_actors_act_greedily(policy: str, kwargs: dict[str, Any], tmp_path: Path) -> None:
     env = make_team_env("TeamSupport", n_envs=4, n_agents=3, grid_size=9, n_treasures=3)
     model = make_model(env, policy, policy_kwargs={"features_extractor_class": LightEncoder} | kwargs).learn(60 * 3)
