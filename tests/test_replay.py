@@ -229,6 +229,18 @@ def test_the_page_in_a_browser(browser: Any, model: PPO, tmp_path: Path) -> None
     assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
 
 
+def test_means_are_of_the_agents_that_are_in_the_game(browser: Any, tmp_path: Path) -> None:
+    env = sb3_saf.make_team_env(CounterEnv, n_envs=1, seed=0, render_mode="rgb_array", deaths={1: 1})
+    other = PPO("IPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
+    page = replay(other, env, tmp_path / "page.html", seed=SEED)
+    recording = record_episodes(other.policy, env, 1, SEED)
+    assert unpacked(data_of(page)["runs"][0]["counted"]).tolist() == [[1, 1], [1, 0], [1, 0]]
+    browser.get(page.as_uri())
+    browser.find_element("tag name", "body").send_keys("\ue014")
+    assert recording.values[1, 0] != recording.values[1, 1]
+    assert f"Mean value {recording.values[1, 0]:.2f}," in browser.find_element("id", "team-value").text
+
+
 def test_returns_have_the_scale_of_values_that_were_learned_with_normalize(tmp_path: Path) -> None:
     words = "--algo mappo --env TeamSupport-v0 --size smoke --seed 0 --eval-freq -1 --verbose 0 -params normalize:true"
     train(["-f", str(tmp_path), *words.split()])

@@ -245,10 +245,13 @@ function drawCritic(run) {
 
 // --- the team --------------------------------------------------------------------------------------------------------
 
+/** Return the agents that take part in step t. */
+const agentsIn = (run, t) => range(data.n_agents).filter((i) => run.counted.at(t, i));
+
 function drawTeam(run) {
   $("team").hidden = !run.values && !run.weights;
   if (run.values) {
-    const mean = (array, t) => range(data.n_agents).reduce((sum, i) => sum + array.at(t, i), 0) / data.n_agents;
+    const mean = (array, t) => agentsIn(run, t).reduce((sum, i, _, { length }) => sum + array.at(t, i) / length, 0);
     const t = row(state.t, run);
     const without = run.message ? `; without messages the mean value changes by ${show(mean(run.message, t), 3)}` : "";
     $("team-value").textContent = `Mean value ${show(mean(run.values, t))}, mean return that came ${show(mean(run.returns, t))}${without} (${run.name})`;
@@ -265,7 +268,7 @@ function zoneTable(run) {
   const zones = [...new Set(data.grid ? data.grid.zones : [0])];
   const sums = new Map(zones.map((zone) => [zone, { count: 0, weights: range(n).map(() => 0) }]));
   for (const t of range(run.steps)) {
-    for (const agent of range(data.n_agents)) {
+    for (const agent of agentsIn(run, t)) {
       const entry = sums.get(data.grid ? data.grid.zones[run.pose.at(t, agent, 0)] : 0);
       entry.count += 1;
       for (const u of range(n)) entry.weights[u] += run.weights.at(t, agent, u);

@@ -157,6 +157,7 @@ def _outputs(recording: EpisodeRecording, game: int, rows: slice, steps: slice) 
         "weights": share(recording.pool_weights, rows),
         "read": share(recording.read_attention, game),
         "write": share(recording.write_attention, game),
+        "counted": _packed(recording.counted[steps, rows], "u1"),
         "values": _packed(recording.values[steps, rows], "f4"),
         "returns": _packed(recording.returns[steps, rows], "f4"),
         "message": None if zero is None else _packed((zero - recording.values)[steps, rows], "f4"),
