@@ -320,9 +320,10 @@ def elsewhere(trainings: pd.DataFrame, here: pd.DataFrame) -> str:
     return (
         table(["experiment", "setting", "processor", "returns of 100"], body)
         + f"\n\n{len(both)} more ({blocks}) have the seeds of trainings in the tables: their returns are "
-        f"{apart.mean():+.1f} on average from those, {apart.min():+.1f} to {apart.max():+.1f}. Two seeds of a setting "
-        f"are within {limit:.1f} in 95 of 100 cases ({len(variances)} settings and methods with five seeds or more, "
-        f"{', '.join(sorted(set(alike['task'])))}); {(apart.abs() <= limit).sum()} of the {len(both)} are."
+        f"{apart.mean():+.1f} on average from those, {apart.min():+.1f} to {apart.max():+.1f}. Twice the "
+        f"standard deviation of a difference of two seeds is {limit:.1f} ({len(variances)} settings and methods with "
+        f"five seeds or more, {', '.join(sorted(set(alike['task'])))}); {(apart.abs() <= limit).sum()} of the "
+        f"{len(both)} are within it."
     )
 
 
