@@ -14,6 +14,7 @@ import sb3_saf
 from sb3_saf import Stage, make_team_env
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
+from tests.toy_envs import CounterEnv
 
 SMALL: Final[dict[str, Any]] = {"n_agents": 3, "grid_size": 8, "n_treasures": 6}
 
@@ -63,6 +64,14 @@ def test_the_end_of_a_stage_truncates_what_is_not_over() -> None:
     assert all(info["TimeLimit.truncated"] for info in infos)
     assert [info["episode"]["l"] for info in infos if "episode" in info] == [1, 1]
     env.close()
+
+
+def test_an_agent_that_dies_as_its_stage_ends_is_not_cut() -> None:
+    env = make_team_env(CounterEnv(max_cycles=9, deaths={1: 4}), time_limit="bootstrap", curriculum=[Stage(4, {})])
+    env.reset()
+    for _ in range(4):
+        *_, infos = env.step(np.zeros(2, np.int64))
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, False]
 
 
 def test_new_seeds_begin_with_the_first_stage() -> None:

@@ -46,7 +46,7 @@ from tests.test_monitor import RETURN_OF_GAME_0, RETURN_OF_GAME_1
 from tests.test_probes import train as train_on_probe
 from tests.test_qplex import make_model as make_qplex
 from tests.test_qplex import telling_env
-from tests.toy_envs import TellingEnv
+from tests.toy_envs import CounterEnv, TellingEnv
 from tests.toy_teams import ToyTeams
 
 LEVEL: dict[str, Any] = {"n_agents": 3, "grid_size": 9, "n_treasures": 30, "heterogeneity": 2, "max_cycles": 6}
@@ -281,6 +281,16 @@ class TestWhatCounts:
         assert game.episode_returns == [RETURN_OF_GAME_1, RETURN_OF_GAME_0, RETURN_OF_GAME_1]
         assert game.episode_lengths == [2, 3, 2]
 
+    def test_episodes_that_were_cut_short_do_not_count(self) -> None:
+        env = make_team_env(
+            "TeamSupport", 4, seed=0, stagger=True, n_agents=3, grid_size=8, n_treasures=6, max_cycles=8
+        )
+        policy = hand_made(IPPOPolicy, env)
+        game = record_episodes(policy, env, 8, seed=3, deterministic=True)
+        env.seed(3)
+        assert game.episode_lengths == [8] * 8
+        assert game.episode_returns == evaluate_team(policy, env, 8).returns
+
     def test_agents_that_take_no_part_do_not_count(self) -> None:
         """Illegal actions fail in this environment; agents die and join."""
         env = make_team_env(TellingEnv(**LIVES), n_envs=2)
@@ -390,6 +400,19 @@ def test_returns_are_the_teams(time_limit: Any, mean_return: float | None) -> No
         return
     assert (recording.last_values[1] != 0).all() and (recording.last_values[0] == 0).all()
     np.testing.assert_allclose(returns[1], 2 + 0.5 * recording.last_values[1])
+
+
+@pytest.mark.parametrize(("deaths", "cuts"), [({2: 1}, {}), ({}, {2: 1})])
+def test_the_teams_value_after_a_time_limit_is_in_all_its_rows(deaths: dict[int, int], cuts: dict[int, int]) -> None:
+    """Agent 2 ends after the first of three steps."""
+    env = make_team_env(CounterEnv(n_agents=3, deaths=deaths, cuts=cuts), n_envs=2, time_limit="bootstrap")
+    recording = record_episodes(make_qplex(env).policy, env, 2, seed=0, gamma=0.5)
+    assert recording.ends.tolist() == [[False] * 6, [False] * 6, [True] * 6]
+    of_teams = recording.last_values[2].reshape(2, 3)
+    assert (of_teams == of_teams[:, :1]).all() and (of_teams != 0).all() and of_teams[0, 0] != of_teams[1, 0]
+    paid = recording.rewards.reshape(3, 2, 3)[:, :, 0]
+    expected = paid[0] + 0.5 * paid[1] + 0.25 * paid[2] + 0.125 * of_teams[:, 0]
+    np.testing.assert_allclose(recording.returns[0].reshape(2, 3), expected[:, np.newaxis].repeat(3, 1), rtol=1e-6)
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ class Curriculum(TeamVecEnvWrapper):
                 last = (
                     {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
                 )
-                is_cut = bool(info.get("active", True))
+                is_cut = info.get(TRUNCATED, bool(info.get("active", True)))
                 info = {**info, TERMINAL_OBSERVATION: last, TRUNCATED: is_cut, STAGGERED: True}
             shown.append(info)
         self._enter(self._present_stage())

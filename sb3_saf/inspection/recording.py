@@ -48,7 +48,15 @@ from sb3_saf.qplex.learning import greedy_q_tot
 from sb3_saf.qplex.policies import QPLEXPolicy, State
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTIVE_KEY, EPISODE_START_KEY, OBS_KEY, TERMINAL_OBSERVATION, TRUNCATED, TerminalRow
+from sb3_saf.teams.rows import (
+    ACTIVE_KEY,
+    EPISODE_START_KEY,
+    OBS_KEY,
+    STAGGERED,
+    TERMINAL_OBSERVATION,
+    TRUNCATED,
+    TerminalRow,
+)
 from sb3_saf.teams.vec_env import require_n_agents, share_of_sum
 
 Tensors = dict[str, th.Tensor]
@@ -412,11 +420,13 @@ class _Recorder:
         columns["team_rewards"].append(of_teams)
         columns["counted"].append(counted)
         columns["rewards"].append(rewards)
-        columns["ends"].append(step.dones)
-        columns["last_values"].append(_last_values(self.reader, step.dones, step.infos))
+        ends = np.repeat(step.ended, n_agents) if of_team else step.dones
+        columns["ends"].append(ends)
+        columns["last_values"].append(_last_values(self.reader, ends, step.infos, n_agents))
         if self.keeps_observations:
             columns["observations"].append(np.array(step.observations[OBS_KEY]))
-        finished = step.ended & counted.reshape(-1, n_agents).any(axis=1)
+        is_cut = np.array([STAGGERED in info for info in step.infos[::n_agents]])
+        finished = step.ended & step.counted & ~is_cut
         self.returns_now += of_teams
         self.lengths_now += 1
         self.returns += self.returns_now[finished].tolist()
@@ -447,10 +457,13 @@ def _active(obs: Any, n_agents: int) -> Bools:
     return np.asarray(obs[ACTIVE_KEY][::n_agents]).reshape(-1) != 0
 
 
-def _last_values(reader: PolicyReader | QReader, dones: Bools, infos: list[dict[str, Any]]) -> Floats:
+def _last_values(reader: PolicyReader | QReader, ends: Bools, infos: list[dict[str, Any]], n_agents: int) -> Floats:
     """Compute values (B,) of last observations at time limits that are no true ends, as SB3 bootstraps them."""
     values = np.zeros(len(infos), dtype=np.float32)
-    rows = np.array([row for row in np.flatnonzero(dones) if infos[row].get(TRUNCATED)], dtype=np.int64)
+    limited = np.array([bool(info.get(TRUNCATED)) for info in infos])
+    if reader.of_team:  # the value is that of all rows, also of agents that ended before
+        limited = limited.reshape(-1, n_agents).any(axis=1).repeat(n_agents)
+    rows = np.flatnonzero(ends & limited)
     if len(rows):
         last = [infos[row][TERMINAL_OBSERVATION] for row in rows]
         obs = {key: np.stack([observation[key] for observation in last]) for key in last[0]}
