@@ -10,7 +10,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_saf import CentralizedValueWrapper, MLPEncoder, evaluate_team, game_seeds, make_team_env
+from sb3_saf import CentralizedValueWrapper, MLPEncoder, evaluate_team, game_seeds, make_team_env, ppo_settings
 from sb3_saf.checkpoints.states import environment_state, load_environment_state
 from sb3_saf.inspection.recording import picture
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
@@ -379,6 +379,21 @@ def test_agents_of_vmas_with_other_spaces() -> None:
         make_team_env("vmas/balance", colour=1)
     with pytest.raises(ValueError, match="vmas/balance tells no state"):
         make_team_env("vmas/balance", state=True)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "params", "is_shared"),
+    [
+        pytest.param("smax/3m", {}, True, marks=needs_jaxmarl),
+        pytest.param("overcooked/cramped_room", {}, True, marks=needs_jaxmarl),
+        pytest.param("overcooked/cramped_room", {"reward_shaping": 1.0}, False, marks=needs_jaxmarl),
+        pytest.param("vmas/flocking", {}, False, marks=needs_vmas),
+        ("hecogrid/TeamSupport-v0", {}, True),
+    ],
+)
+def test_advantages_are_each_agents_where_rewards_are(env_id: str, params: dict[str, Any], is_shared: bool) -> None:
+    settings = ppo_settings(make_team_env(env_id, n_envs=2, seed=0, **params))
+    assert ("rollout_buffer_kwargs" not in settings) == is_shared
 
 
 STAGGERED = [

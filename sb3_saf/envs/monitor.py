@@ -65,8 +65,6 @@ class TeamMonitor(TeamVecEnvWrapper):
         super().__init__(venv, n_agents)
         #: Factor of the sum of a team's rewards.
         self.share_of_sum = 1.0 if team_return == "sum" else 1.0 / self.n_agents
-        #: Whether every agent is given the whole reward of its team.
-        self.shares_reward = team_return == "mean"
         columns = sorted(_COLUMNS.intersection(info_keywords))
         if columns:
             raise ValueError(

@@ -193,7 +193,7 @@ def shares_reward(venv: VecEnv) -> bool:
     """
     Return whether all agents of a team are known to receive the same reward.
 
-    Layers with an attribute ``shares_reward`` say so: ``SharedReward``, HECOGrid, suites whose unit is the mean.
+    Layers with an attribute ``shares_reward`` say so: ``SharedReward``, HECOGrid, SMAX, Overcooked.
     """
     found: list[Any] = [layer for layer in layers(venv) if _has_own(layer, "shares_reward")]
     return any(layer.shares_reward for layer in found)

@@ -37,6 +37,7 @@ class Rules(NamedTuple):
     :param is_undecided: ``(env, state) -> bool``, whether an ended game was stopped by its time limit; None if
         ``state.step`` reaching ``env.max_steps`` decides
     :param is_won: ``(env, state) -> bool`` of an ended game, None if success is not defined
+    :param shares_reward: whether every agent receives the team's reward, extra rewards aside
     :param pays_the_dead: whether dead agents receive the team's reward until its episode ends. Their rows then
         continue: if they ended, dead agents would not learn from the team's success
     :param extra_reward: ``infos -> {agent: reward}`` for :attr:`JaxGames.extra_weight`
@@ -45,6 +46,7 @@ class Rules(NamedTuple):
 
     is_undecided: Callable[[Any, Any], Any] | None = None
     is_won: Callable[[Any, Any], Any] | None = None
+    shares_reward: bool = False
     pays_the_dead: bool = False
     extra_reward: Callable[[Any], Mapping[str, Any]] | None = None
     draw: Callable[[Any, Any], npt.NDArray[np.uint8]] | None = None
@@ -294,7 +296,10 @@ class JaxGames(ResumableBatch):
     def __init__(
         self, programs: JaxPrograms, n_games: int, extra_weight: float = 0.0, extra_steps: int | None = None
     ) -> None:
-        super().__init__(n_games, programs.agents, programs.rows, programs.action_space, programs.env)
+        super().__init__(
+            *(n_games, programs.agents, programs.rows, programs.action_space, programs.env),
+            shares_reward=programs.rules.shares_reward and not extra_weight,
+        )
         self._programs = programs
         self._extra_weight = extra_weight
         self._extra_steps = extra_steps
@@ -441,12 +446,14 @@ def _draw_particles(env: Any, state: Any) -> Picture:
 
 #: Of the infos of both kitchens.
 _shaped: Final = itemgetter("shaped_reward")
-_SMAX: Final = Rules(is_undecided=_both_alive, is_won=_enemies_dead, pays_the_dead=True, draw=_draw_smax)
+_SMAX: Final = Rules(
+    is_undecided=_both_alive, is_won=_enemies_dead, shares_reward=True, pays_the_dead=True, draw=_draw_smax
+)
 _RULES: Final[dict[str, Rules]] = {
-    "SMAX": _SMAX._replace(is_won=None),  # both sides are trained, one wins
+    "SMAX": _SMAX._replace(is_won=None, shares_reward=False),  # both sides are trained, one wins
     "HeuristicEnemySMAX": _SMAX,
     "switch_riddle": Rules(is_undecided=_never),  # its number of days is a rule of the riddle
-    "overcooked": Rules(extra_reward=_shaped, draw=_draw_overcooked),
+    "overcooked": Rules(shares_reward=True, extra_reward=_shaped, draw=_draw_overcooked),
     "overcooked_v2": Rules(extra_reward=_shaped, draw=_draw_overcooked_v2),
 }
 
