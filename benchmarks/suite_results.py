@@ -59,6 +59,7 @@ _KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_co
 #: The cheapest ones first.
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000),
+    Task("vmas/balance", 10_000_000),
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
     Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000),
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
