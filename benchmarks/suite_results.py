@@ -59,9 +59,9 @@ _KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_co
 #: The cheapest ones first.
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000),
-    Task("vmas/balance", 10_000_000),
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
     Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000),
+    Task("vmas/balance", 10_000_000),
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
     Task("lbf/Foraging-15x15-4p-3f-v3", 5_000_000),
     *(Task(f"overcooked/{layout}", 5_000_000, params=("reward_shaping_steps:2500000",)) for layout in _KITCHENS),
