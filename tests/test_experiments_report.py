@@ -27,7 +27,7 @@ from tests.experiments_jobs import InlineEngine, read_table
 
 pytest.importorskip("rliable")
 TASKS = ("TeamTogether", "TeamSupport")
-LEVELS = [f"{task}-c{c}-h1" for task in TASKS for c in (1, 2, 3)]
+LEVELS = [f"{task}-c{c}-h1" for task in TASKS for c in (1, 2)]
 N_CELLS = (2 + 1) * len(LEVELS) * 2
 
 
@@ -35,7 +35,7 @@ N_CELLS = (2 + 1) * len(LEVELS) * 2
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Create a finished run of two tasks and two methods."""
     path = tmp_path_factory.mktemp("coordination")
-    selection = Selection((0, 1), ("saf", "ippo"), tuple(f"{task}-v0" for task in TASKS))
+    selection = Selection((0, 1), ("saf", "ippo"), tuple(f"{task}-v0" for task in TASKS), ("1", "2"))
     config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80}, 16, 40, 2)
     assert run(find_experiment("coordination"), selection, config, Results(path), InlineEngine()).finished == N_CELLS
     return path
@@ -71,7 +71,7 @@ def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> N
     assert "over 16 new games with drawn actions, the same for all methods of a seed" in page
     again = (
         "run coordination --size smoke --game-steps 80 --hyperparams n_epochs:1 --eval-freq 40 --eval-episodes 2 "
-        "--episodes 16 --seeds 0 1 --methods saf ippo --tasks TeamTogether TeamSupport"
+        "--episodes 16 --seeds 0 1 --methods saf ippo --levels 1 2 --tasks TeamTogether TeamSupport"
     )
     assert f"python -m sb3_saf.experiments {again} -f {folder}" in page
     assert page.count("python -m sb3_saf.train --algo ") == 2 * len(LEVELS) * 2
@@ -140,14 +140,14 @@ def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFix
     (other / "curve.csv").write_text("x,y\n1,2\n")
     failed.mkdir(parents=True)
     (failed / "error.txt").write_text("out of luck")
-    page = report(part, "--levels", "1", "2")
-    assert f"**4 of {2 * N_CELLS // 3} cells are missing**" in page
+    page = report(part)
+    assert f"**4 of {N_CELLS} cells are missing**" in page
     assert "- saf TeamTogether c=1, h=1 seed 1: not run yet" in page
     assert f"- ippo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page
     assert f"- damaged: {damaged / 'finished.json'} cannot be read: " in page
     assert f"- damaged: {other / 'curve.csv'} has changed since the run was finished" in page
     assert "| SAF | – |" in page
-    assert f"4 of {2 * N_CELLS // 3} cells are missing; the page names them" in capsys.readouterr().err
+    assert f"4 of {N_CELLS} cells are missing; the page names them" in capsys.readouterr().err
 
 
 def test_commits_that_differ_are_in_the_warning(folder: Path, page: str, tmp_path: Path) -> None:
@@ -255,6 +255,8 @@ def test_published_trainings_with_other_settings_have_names_of_their_own(folder:
     theirs = Frames(
         tests.assign(training=published.tests["training"].mask(saf, "other")) if told else tests, published.curves
     )
+    again = tests.assign(episodes=2, training=published.tests["training"])  # with another number of test games
+    assert {"saf (published)", "ippo (published)"} <= set(beside(mine, Frames(again, theirs.curves)).tests["method"])
     both = beside(mine, theirs)
     counts = both.tests.groupby("method")["seed"].nunique().to_dict()
     names = {"saf": 1, "saf (published)": 2, "random": 2}

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,18 @@ from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import sb3_saf
-from sb3_saf import PQN, QPLEX, CheckpointError, TeamCheckpointCallback, TeamEvalCallback, resumable_learn, resume
+from sb3_saf import (
+    PQN,
+    QPLEX,
+    CheckpointError,
+    TeamCheckpointCallback,
+    TeamEvalCallback,
+    TeamMonitor,
+    resumable_learn,
+    resume,
+)
+from sb3_saf.envs.curriculum import Curriculum
+from sb3_saf.teams.vec_env import layers
 from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv, TellingEnv
 from tests.weights import weights_of
 
@@ -419,6 +431,41 @@ def test_games_that_cannot_be_copied_begin_new_episodes_and_say_so_at_the_start(
     assert model.num_timesteps == WHOLE
     log = (tmp_path / "log" / "log.txt").read_text()
     assert "new episodes begin" in log and "cannot give the state of its games" in log
+
+
+@pytest.mark.filterwarnings("ignore:SuperSuitVecEnv cannot give")
+@pytest.mark.parametrize("game", [StreamEnv, LazyEnv])
+def test_nothing_but_the_games_begins_anew(game: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Games that cannot be copied, and another user's: stage, statistics, files and counters go on."""
+    game_steps, folder = ROLLOUT // N_AGENTS, str(tmp_path)
+
+    def start() -> tuple[Any, TeamEvalCallback]:
+        stages = [sb3_saf.Stage(game_steps, {"max_cycles": 3})]
+        env = sb3_saf.make_team_env(game, N_GAMES, seed=3, monitor_dir=folder, curriculum=stages, max_cycles=5)
+        env = sb3_saf.CentralizedValueWrapper(VecNormalize(env.venv, norm_obs_keys=["obs"]))
+        eval_env = sb3_saf.CentralizedValueWrapper(
+            VecNormalize(sb3_saf.make_team_env(game, 2, seed=50, max_cycles=5).venv, norm_obs_keys=["obs"])
+        )
+        model = make(env=env, policy_kwargs={"net_arch": [8]})
+        return model, TeamEvalCallback(eval_env, n_eval_episodes=2, eval_freq=game_steps, log_path=folder, verbose=0)
+
+    model, evaluation = start()
+    struck(tmp_path / "ck", model, 20, evaluation)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other user"))
+    model, evaluation = start()
+    message = "not signed with this user's key.*New episodes begin" if game is LazyEnv else None
+    with pytest.warns(UserWarning, match=message) if message else nullcontext():
+        go_on(tmp_path / "ck", model, evaluation)
+    assert evaluation.evaluations_game_steps == [game_steps * n for n in (1, 2, 3, 4)]
+    normalised, monitor, curriculum = (
+        next(layer for layer in layers(model.env) if isinstance(layer, kind))
+        for kind in (VecNormalize, TeamMonitor, Curriculum)
+    )
+    assert (curriculum.game_steps, curriculum.stage) == (4 * game_steps, 1)
+    rows_and_resets = N_AGENTS * N_GAMES * (4 * N_STEPS + 2)
+    assert normalised.obs_rms["obs"].count == pytest.approx(rows_and_resets, abs=1)
+    lines = (tmp_path / "monitor.csv").read_text().splitlines()
+    assert len(lines) == 2 + monitor.episode_count and not list(tmp_path.glob("monitor.csv.*"))
 
 
 def test_pickled_games_of_strangers_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,6 +87,7 @@ def test_a_team_plays_its_games_again(published: Path, method: str) -> None:
     env = model.get_env()
     assert env is not None
     assert len(evaluate_team(model, env, 3).returns) == 3
+    assert getattr(model, "exploration_rate", 0.0) == 0.0  # its actions are those that it has learned
     env.close()
     assert check_team(f"{LEVEL}/{method}", published).endswith(ALL_EQUAL)
     assert f"{TEST_GAMES} games" in check_team(f"{LEVEL}/{method}", published, batches=1)

@@ -156,8 +156,10 @@ def test_runs_are_numbered_and_never_shared(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = train(tmp_path, "--eval-freq", "-1", "-n", "40") / f"{ENV}.zip"
-    again = ("-i", str(first), "-params", "learning_rate:1e-30")
+    optimizer = "policy_kwargs:{optimizer_kwargs: {betas: [0.5, 0.6]}}"
+    again = ("-i", str(first), "-params", "learning_rate:1e-30", optimizer)
     second = train(tmp_path, "--eval-freq", "-1", "-n", "40", *again) / f"{ENV}.zip"
+    assert PPO.load(second).policy.optimizer.param_groups[0]["betas"] == (0.5, 0.6)  # not those of the first
     assert f"the weights and the optimiser of {first}; no code is loaded" in capsys.readouterr().out
     other = ["--algo", "mappo", "--size", "smoke", "--env", ENV, "-f", str(tmp_path), "-i", str(first)]
     assert "do not fit MAPPOPolicy" in failed(other, capsys)
@@ -202,7 +204,7 @@ def test_any_environment_is_trained_watched_drawn_and_tuned(tmp_path: Path, caps
     gif = tmp_path / "game.gif"
     result = zoo_enjoy.enjoy(["--env", COUNTER, "-f", logs, "--episodes", "2", "--gif", str(gif)])
     assert set(result.lengths) == {5} and gif.is_file()
-    zoo_plot.main(["curves", "-f", logs, "-o", str(tmp_path / "curves.svg"), "--env", COUNTER])
+    zoo_plot.main(["-f", logs, "-o", str(tmp_path / "curves.svg"), "--env", COUNTER])
     assert "<!-- team return -->" in (tmp_path / "curves.svg").read_text()  # not treasures
     zoo_train.main(["-optimize", "--n-trials", "1", *short])
     assert "Best: trial 0" in capsys.readouterr().out
@@ -363,7 +365,6 @@ def test_mistakes_are_one_line(
     [
         zoo_train.main,
         zoo_enjoy.main,
-        *(partial(zoo_plot.main, [kind]) for kind in ("curves", "levels", "aggregate")),
         zoo_plot.main,
         *(partial(experiments_main, [name]) for name in ("list", "plan", "run", "report", "check", "cell")),
         experiments_main,

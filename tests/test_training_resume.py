@@ -54,7 +54,7 @@ def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
     for evaluation in (2, 3):
         struck(tmp_path / "run", algo, *options, at=evaluation)
     (tmp_path / "run" / algo / f"{ENV}_1" / ".writing-0-best_model.zip").touch()  # as left by SIGKILL
-    train(tmp_path / "run", algo, *options)  # the seed is the run's
+    train(tmp_path / "run", algo, *options, "--checkpoint-freq", "-1")  # writes no more; the seed is the run's
     assert f"Going on with {tmp_path}" in capsys.readouterr().out
     one, other = (tmp_path / name / algo / f"{ENV}_1" for name in ("undisturbed", "run"))
     assert results_of(one) == results_of(other) != {}

@@ -249,8 +249,8 @@ class TeamCheckpointCallback(BaseCallback):
         except CheckpointError as error:
             self.exact = False
             message = (
-                f"{str(error).partition(';')[0]}. If this run is interrupted, it goes on with the weights, optimiser "
-                "and counters of its last checkpoint and begins new episodes"
+                f"{str(error).partition(';')[0]}. If this run is interrupted, it goes on from its last checkpoint and "
+                "begins new episodes"
             )
             warnings.warn(message, UserWarning, stacklevel=2)
             self.logger.log(message)
@@ -301,8 +301,8 @@ class TeamCheckpointCallback(BaseCallback):
             "software": software(self.model),
             "description": self._run.description,
             "model": model_state(self.model),
-            "environment": environment_state(self.training_env) if self.exact else None,
-            "callbacks": callback_states(self.others) if self.exact else None,
+            "environment": environment_state(self.training_env, bool(self.exact)),
+            "callbacks": callback_states(self.others, bool(self.exact)),
             "generators": generator_states(self.model),
             "logger": logger_state(self.model.logger),
         }
@@ -363,18 +363,19 @@ def resume(
             f"the checkpoint is of another run: {different}; make model, games and callbacks as for the first start, "
             "or give this run a folder of its own"
         )
-    if exact and tree["environment"] is None:
+    environments = [tree["environment"], *(one["eval_env"] for one in tree["callbacks"] if one["eval_env"])]
+    if exact and any(None in states for states in environments):
         raise CheckpointError(f"expected the state of the games with exact=True, got {loaded.path} without it")
-    games = [tree["environment"], tree["callbacks"]]
     if trust_games:
-        sign_games(games)
+        sign_games(environments)
     try:
-        check_signatures(games)
+        check_signatures(environments)
     except ForeignGamesError as error:
         if exact:
             raise
         warnings.warn(f"{error}. New episodes begin; everything else continues", UserWarning, stacklevel=2)
-        tree = {**tree, "environment": None, "callbacks": None}
+        for states in environments:
+            states[:] = [None if any(pickled_games(state)) else state for state in states]
     if different := differences(tree["software"], software(model)):
         warnings.warn(
             f"the checkpoint was made under other conditions ({different}): the run goes on, but its weights may "
@@ -384,21 +385,20 @@ def resume(
         )
     try:
         load_model_state(model, tree["model"])
-        if tree["environment"] is not None:
-            load_callback_states(others, tree["callbacks"])
-            load_environment_state(env, tree["environment"])
-        else:
-            # Not the seeds of the first start, whose games were played already.
+        begins_anew = None in tree["environment"]
+        if begins_anew:  # not with the seeds of the first start, whose games were played already
             env.seed(int(np.random.SeedSequence([model.seed or 0, model.num_timesteps]).generate_state(1)[0]))
             model._last_obs = None
+        load_callback_states(others, tree["callbacks"])
+        load_environment_state(env, tree["environment"])
         continue_logs(model, tree["logger"])
         _RUNS[model] = Run(tree["run"], tree["description"])
         load_generator_states(tree["generators"], model)  # last: the calls above may draw from them
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise CheckpointError(f"the checkpoint {loaded.path} does not fit: {reason}; make a new model") from error
-    message = "new episodes begin" if tree["environment"] is None else "the games go on where they were, bit for bit"
-    if any(pickled_games([tree["environment"], tree["callbacks"]])):
+    message = "new episodes begin" if begins_anew else "the games go on where they were, bit for bit"
+    if any(pickled_games(environments)):
         message += "; they were unpickled from it, as this user signed them"
     model.logger.log(f"Resumed from {loaded.path}: {message}")
     return loaded.path

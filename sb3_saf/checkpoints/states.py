@@ -90,9 +90,23 @@ class Stateful(Protocol):
 # --- environments -----------------------------------------------------------------------------------------------------
 
 
-def environment_state(venv: VecEnv) -> list[Tree]:
-    """Return the state of every layer, outermost first; a CheckpointError names a layer without one, and a fix."""
-    return [_layer_state(layer) for layer in layers(venv)]
+def environment_state(venv: VecEnv, with_games: bool = True) -> list[Tree]:
+    """
+    Return the state of every layer, outermost first.
+
+    :param with_games: False to have None for the games, and for wrappers without a state
+    :raises CheckpointError: naming a layer without a state, and a fix
+    """
+    *wrappers, games = layers(venv)
+    if with_games:
+        return [_layer_state(layer) for layer in (*wrappers, games)]
+    states: list[Tree] = []
+    for layer in wrappers:
+        try:
+            states.append(_layer_state(layer))
+        except CheckpointError:
+            states.append(None)
+    return [*states, None]
 
 
 def _is_stateful(layer: VecEnv) -> TypeGuard[Stateful]:
@@ -117,8 +131,10 @@ def _layer_state(layer: VecEnv) -> Tree:
 
 
 def load_environment_state(venv: VecEnv, states: list[Tree]) -> None:
-    """Restore the states of all layers; a curriculum's own state determines the games below it."""
+    """Restore the states of all layers that have one; a curriculum's own state determines the games below it."""
     for layer, state in zip(layers(venv), states, strict=True):
+        if state is None:
+            continue
         if _is_stateful(layer):
             layer.load_checkpoint_state(state)
         elif isinstance(layer, VecNormalize):
@@ -172,13 +188,15 @@ def all_callbacks(callback: Callbacks) -> Iterator[BaseCallback]:
         yield from all_callbacks(callback.callback_on_new_best)
 
 
-def callback_states(callbacks: Iterable[BaseCallback]) -> list[Tree]:
-    """Return the states of callbacks; CheckpointError if an evaluation environment has no state."""
+def callback_states(callbacks: Iterable[BaseCallback], with_games: bool = True) -> list[Tree]:
+    """Return the states of callbacks and, as :func:`environment_state` does, of their evaluation environments."""
     return [
         {
             "counters": {name: getattr(callback, name) for name in _counters(callback)},
             "own": dict(callback.checkpoint_state()) if isinstance(callback, Stateful) else None,
-            "eval_env": environment_state(callback.eval_env) if isinstance(callback, EvalCallback) else None,
+            "eval_env": environment_state(callback.eval_env, with_games)
+            if isinstance(callback, EvalCallback)
+            else None,
         }
         for callback in callbacks
     ]

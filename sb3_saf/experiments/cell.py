@@ -49,7 +49,7 @@ from sb3_saf.training.folders import (
     software_versions,
     write_run,
 )
-from sb3_saf.training.run import RunOptions, load_parameters, train
+from sb3_saf.training.run import RunOptions, train
 
 #: Checkpoints of a training, from which another worker continues if this one is killed.
 CHECKPOINTS_PER_CELL: Final = 20
@@ -164,8 +164,8 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
     player = RandomPolicy(env, seed=cell.seed) if model is None else model
     draws = (DRAWN, MOST_LIKELY) if settings.spec.draws_actions else (MOST_LIKELY,)
     for policy, actions in product((BEST, LAST), draws) if cell.is_trained else [(BEST, DRAWN)]:
-        if model is not None:
-            load_parameters(model, models / (BEST_MODEL if policy == BEST else MODEL))  # only numbers are read
+        if model is not None and actions == draws[0]:
+            model.policy.load_state_dict(read_weights(models / (BEST_MODEL if policy == BEST else MODEL)))
         clock = time.perf_counter()
         result = play_test(player, env, cell.seed, config.episodes, actions == MOST_LIKELY)
         if not np.isfinite(result.returns).all():
@@ -173,7 +173,7 @@ def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> L
         measured = result.returns, result.lengths, list(result.successes), list(result.agent_means)
         plays.append(Play(policy, actions, *measured, time.perf_counter() - clock))
     env.close()
-    return LevelResult(level.env_kwargs, settings.n_agents, settings.env_kwargs.get("n_treasures"), plays)
+    return LevelResult(level.env_kwargs, settings.n_agents, settings.n_treasures, plays)
 
 
 # --- check ------------------------------------------------------------------------------------------------------------

@@ -252,8 +252,8 @@ def _head(content: Content) -> str:
         "",
         f"Size `{config.size}`: {_numbers(table['n_agents'])} agents{treasures}, {steps} game steps of training. "
         f"{', '.join(methods) or 'No method'} and a random team, seeds {_numbers(table['seed'])}. Each number is "
-        f"{meaning} of the best policy of a run by evaluations during training, over {config.episodes} new games with "
-        f"{actions}, the same for all methods of a seed.",
+        f"{meaning} of the best policy of a run by evaluations during training, over {_numbers(table['episodes'])} new "
+        f"games with {actions}, the same for all methods of a seed.",
     ]
     if config.overrides:
         lines += ["", f"Settings in the place of those of `zoo_configs`: `{dict(config.overrides)}`."]

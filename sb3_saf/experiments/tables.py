@@ -114,16 +114,17 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
     :param ours: results, whose cells take precedence
     :param theirs: published results; only those on the same games (task, level, agents, largest return, parameters) and
         of trainings of the same length are taken. A method that was trained with other settings than ours of its name,
-        or does not tell them, is ``NAME (published)``
+        or does not tell them, or was tested by other numbers of episodes or kinds of actions, is ``NAME (published)``
     """
     here, games = ours.tests, ["task", "level", "n_agents", "max_return"]
     games += ["game"] if "game" in theirs.tests else []  # older ones do not tell
     rows, known = (tests.fillna({"max_return": -1}) for tests in (theirs.tests, here))
     same_games = keys_of(rows, *games).isin(keys_of(known, *games))
     rows = theirs.tests[same_games & rows["game_steps"].isin({0, *here["game_steps"]})]
-    rows = rows.assign(training=rows.get("training", "not told"))
+    protocol = "method", "training", "episodes", "actions"
+    rows = rows.assign(**{name: rows.get(name, "not told") for name in protocol})
     differs = rows["method"].isin(here["method"]) & (rows["method"] != RANDOM)
-    differs &= ~keys_of(rows, "method", "training").isin(keys_of(here, "method", "training"))
+    differs &= ~keys_of(rows, *protocol).isin(keys_of(here, *protocol))
     other = {method: f"{method} (published)" for method in rows["method"][differs]}
     rows, their_curves = (table.assign(method=table["method"].replace(other)) for table in (rows, theirs.curves))
     names = "method", "task", "train_level", "level", "seed"

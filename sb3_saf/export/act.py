@@ -34,7 +34,8 @@ Array: TypeAlias = npt.NDArray[Any]
 class Memory:
     """
     Memory of an actor in an episode: its states (K, ...) by name, or those of each agent by the agent's name; zeros at
-    first, updated by :meth:`Actor.act`. Make a new one for each episode.
+    first, updated by :meth:`Actor.act`. Make a new one for each episode, and for an agent that comes back after steps
+    in which it did not take part.
     """
 
     def __init__(self) -> None:

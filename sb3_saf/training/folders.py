@@ -53,8 +53,6 @@ _UNLISTED: Final = (MONITOR, FINISHED)
 Source = Literal["evaluation", "training"]
 #: Maximum number of points of a learning curve.
 CURVE_POINTS: Final = 100
-#: Last fraction of training whose episodes are its result.
-_FINAL_PART: Final = 0.1
 
 #: Packages whose versions can change a result.
 _PACKAGES: Final = (
@@ -186,14 +184,6 @@ class Run:
                 return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
         except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is not what sb3_saf.train writes: {error}") from error
-
-    def final_score(self, source: Source) -> float:
-        """Return the mean team return of the last evaluation, or of the last tenth of training."""
-        curve = self.curve(source)
-        if source == "evaluation":
-            return float(curve["score"].iloc[-1])
-        late = curve["game_steps"] > (1 - _FINAL_PART) * curve["game_steps"].iloc[-1]
-        return float(curve["score"][late].mean())
 
 
 def training_curve(monitor: str | Path, n_points: int = CURVE_POINTS) -> pd.DataFrame:
@@ -405,6 +395,8 @@ def load_team(env: str, method: str, folder: str | Path | None = None, *, device
         games = run.settings.make_env(run.seed, evaluation=True)
         model = run.settings.make_model(games, run.seed, device=device)
         load_weights(model, run.folder / WEIGHTS)
+        if hasattr(model, "exploration_rate"):
+            model.exploration_rate = 0.0  # a new model explores with every action
         games.seed(evaluation_seed(run.seed, test=0))  # an algorithm seeds its games for training
     return model
 

@@ -371,7 +371,7 @@ class Training:
             arguments["log_interval"] = options.log_interval or None
         checkpoint_freq = self._every(options.checkpoint_freq, CHECKPOINTS_PER_RUN)
         try:
-            if self.folder is None or checkpoint_freq == 0:
+            if self.folder is None or (checkpoint_freq == 0 and not any((self.folder / CHECKPOINTS).glob("*.ckpt"))):
                 with settings_restored_on_error(self.model):
                     self.model.learn(total, [FiniteCallback(), GameStepsCallback(), *self.callbacks], **arguments)
             else:
@@ -380,7 +380,7 @@ class Training:
                     total,
                     self.folder / CHECKPOINTS,
                     self.callbacks,
-                    every_game_steps=checkpoint_freq,
+                    every_game_steps=checkpoint_freq or self.settings.game_steps,
                     keep=2,
                     again=options.resume_hint,
                     **arguments,
@@ -473,17 +473,20 @@ class Training:
 def load_parameters(model: BaseAlgorithm, path: Path) -> None:
     """
     Load weights and optimiser state of a saved model, a ``.zip``. Only tensors are read: no code of the file is run.
+    The optimiser's settings, such as its weight decay, stay those of ``model``.
 
     :param model: model with the policy and the ``policy_kwargs`` of the saved one
     :raises ValueError: if the file is damaged or does not fit
     """
     read_weights(path)  # a damaged file is named as such
     optimizer = model.policy.optimizer
-    settings = set(optimizer.param_groups[0])
+    settings = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
     try:
         model.set_parameters(str(path), device=model.device)
-        if missing := settings - set(optimizer.param_groups[0]):
+        if missing := set(settings[0]) - set(optimizer.param_groups[0]):
             raise ValueError(f"its optimizer has no {', '.join(sorted(missing))}: another algorithm's")
+        for group, own in zip(optimizer.param_groups, settings, strict=True):
+            group.update(own)
     except Exception as error:  # errors of zipfile, the unpickler and torch have no common class
         reason = " ".join(str(error).split())[:300]
         raise ValueError(

@@ -125,6 +125,12 @@ class Settings:
         return find_environment(self.env_id)
 
     @property
+    def n_treasures(self) -> int | None:
+        """Treasures of a HECOGrid game, the largest team return; None for other games, whatever their parameters."""
+        suite = self.environment.suite
+        return None if suite is None or suite.name != HOME else int(self.env_kwargs["n_treasures"])
+
+    @property
     def total_timesteps(self) -> int:
         """Argument of ``learn``: agent steps, as SB3 counts."""
         return self.game_steps * self.n_agents
