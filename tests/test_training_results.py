@@ -12,7 +12,6 @@ from typing import Any
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,7 +21,6 @@ from stable_baselines3.common.utils import set_random_seed
 from sb3_saf import EvaluationResult, evaluate_team
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training import enjoy as zoo_enjoy
-from sb3_saf.training import figures
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run, training_curve, write_run
@@ -180,7 +178,6 @@ def test_runs_are_found_and_described(logs: Path) -> None:
     expected = [("saf", seed, c) for seed in (0, 1) for c in (1, 2)] + [("mappo", 0, c) for c in (1, 2)]
     assert found == sorted(expected)
     assert set(setting_names(table)) == {"TeamTogether, coordination 1", "TeamTogether, coordination 2"}
-    assert set(setting_names(table, ["coordination"])) == {"TeamTogether"}
 
 
 def test_results_of_a_run(logs: Path) -> None:
@@ -190,7 +187,6 @@ def test_results_of_a_run(logs: Path) -> None:
     curve = run.curve("evaluation")
     assert curve["game_steps"].tolist() == [80, 160]
     assert curve["score"].tolist() == means.tolist()
-    assert run.final_score("evaluation") == means[-1]
     training = run.curve("training")
     returns = np.genfromtxt(run.folder / "monitor.csv", delimiter=",", skip_header=2)[:, 0]
     assert training["game_steps"].tolist() == [40, 80, 120, 160]  # 16 episodes in 4 games
@@ -198,7 +194,6 @@ def test_results_of_a_run(logs: Path) -> None:
     columns = ["game_steps", "score", "episodes"]
     of_monitor = training_curve(run.folder, 4)[columns].astype(float)
     pd.testing.assert_frame_equal(of_monitor, training[columns])
-    assert run.final_score("training") == training["score"].iloc[-1]
 
 
 def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_once(
@@ -215,9 +210,11 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
         table["run"][0].curve("evaluation")
     fake_run(tmp_path, 4, seed=1)
     figure = str(tmp_path / "curves.png")
-    zoo_plot.main(["curves", "-f", str(tmp_path), "--source", "training", "-o", figure])
+    zoo_plot.main(["-f", str(tmp_path), "--source", "training", "-o", figure])
     assert capsys.readouterr().err.count("left out: ") == 1  # the run without episodes
-    assert "has no evaluations" in failed(["curves", "-f", str(tmp_path), "-o", figure], capsys, zoo_plot.main)
+    fake_run(tmp_path, 5, game_steps=40)  # as run 1, not finished
+    assert [run.number for run in describe(find_runs(tmp_path))["run"]] == [1, 3, 4]
+    assert "has no evaluations" in failed(["-f", str(tmp_path), "-o", figure], capsys, zoo_plot.main)
 
 
 def fake_run(folder: Path, number: int, seed: int = 0, options: dict[str, Any] | None = None, **overrides: Any) -> None:
@@ -249,38 +246,13 @@ def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
     assert list(describe(find_runs(tmp_path / "shared"))["method"]) == ["saf", "saf"]  # what all share is not named
 
 
-def test_games_that_state_a_parameter_and_games_that_do_not_are_apart(
-    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_games_that_state_a_parameter_and_games_that_do_not_are_apart(tmp_path: Path) -> None:
     for number, stated in ((1, {}), (2, {"max_cycles": 7})):
-        settings = load_settings("saf", "tests.toy_envs:CounterEnv", "smoke", stated)
+        settings = load_settings("saf", "tests.toy_envs:CounterEnv", "smoke", {**stated, "deaths": {}})
         write_run(tmp_path / "saf" / f"Counter_{number}", settings.as_dict(), 0, "")
     table = describe(find_runs(tmp_path))
     assert table["max_cycles"].tolist() == ["default", 7]
     assert [name.partition(", ")[2] for name in setting_names(table)] == ["max_cycles default", "max_cycles 7"]
-    first, *others = describe(find_runs(logs)).to_dict("records")
-    table = pd.DataFrame([{**first, "coordination": "default"}, *others])
-    monkeypatch.setattr(zoo_plot, "describe", lambda _: table)
-    zoo_plot.main(["levels", "-f", str(logs), "-o", str(tmp_path / "levels.png")])
-    assert capsys.readouterr().err == f"left out: {first['run'].folder} states no coordination\n"
-
-
-def test_returns_of_games_without_a_largest_one_are_shares_of_their_range(
-    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Returns of different games cannot be averaged; those of treasures are shares of all treasures."""
-    drawn: list[dict[str, Any]] = []
-
-    def draw(scores: dict[str, Any], *_: Any) -> Any:
-        drawn.append(scores)
-        return plt.figure()
-
-    monkeypatch.setattr(figures, "draw_aggregates", draw)
-    table = describe(find_runs(logs, ["saf"])).drop(columns="n_treasures")
-    monkeypatch.setattr(zoo_plot, "describe", lambda _: table)
-    zoo_plot.main(["aggregate", "-f", str(logs), "--algos", "saf", "-o", str(tmp_path / "a.png")])
-    (scores,) = drawn[0].values()
-    assert scores.min(axis=0).tolist() == [0, 0] and set(scores.max(axis=0)) <= {0, 1}
 
 
 def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: Path) -> None:
@@ -291,25 +263,12 @@ def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: 
     assert list(describe(find_runs(tmp_path))["method"]) == expected
 
 
-@pytest.mark.parametrize(
-    ("kind", "source"), [("curves", "training"), ("levels", "evaluation"), ("aggregate", "evaluation")]
-)
-def test_figures_from_a_folder(kind: str, source: str, logs: Path, tmp_path: Path) -> None:
+def test_a_figure_from_a_folder(logs: Path, tmp_path: Path) -> None:
     output = tmp_path / "new" / "figure.png"
-    algos = ["saf", "mappo"]
-    zoo_plot.main([kind, "-f", str(logs), "--algos", *algos, "--source", source, "-o", str(output)])
+    zoo_plot.main(["-f", str(logs), "--algos", "saf", "mappo", "-o", str(output)])
     picture = imageio.imread(output)
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 50
-
-
-def test_scores_are_those_of_finished_runs(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(logs, tmp_path / "logs")
-    finished = sorted((tmp_path / "logs" / "mappo").glob("*/finished.json"))
-    finished[0].unlink()
-    where = ["-f", str(tmp_path / "logs"), "-o", str(tmp_path / "a.png")]
-    zoo_plot.main(["levels", "--level", "coordination", "--algos", "saf", "mappo", *where])
-    assert f"left out: {finished[0].parent} is not finished" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -329,7 +288,7 @@ def test_damaged_results_are_one_line(
     if name == "monitor.csv":  # of a run that is not finished
         (run / "curve.csv").unlink()
     source = "evaluation" if name == "evaluations.npz" else "training"
-    options = ["curves", "-f", str(tmp_path), "--source", source, "-o", str(tmp_path / "a.png")]
+    options = ["-f", str(tmp_path), "--source", source, "-o", str(tmp_path / "a.png")]
     assert f"{name} {words}" in failed(options, capsys, zoo_plot.main)
 
 
@@ -357,14 +316,11 @@ def test_plots_of_rl_zoo3_read_the_folders(logs: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["curves", "-f", "nowhere", "-o", "a.png"], "there is no folder nowhere"),
-        (["curves", "-o", "a.txt"], "Format 'txt' is not supported (supported formats: "),
-        (["levels", "--level", "cordination", "-o", "a.png"], "did you mean 'coordination'"),
-        (["aggregate", "-o", "a.png"], "aggregates"),
+        (["-f", "nowhere", "-o", "a.png"], "there is no folder nowhere"),
+        (["-o", "a.txt"], "Format 'txt' is not supported (supported formats: "),
     ],
 )
 def test_mistakes_in_plot_are_one_line(
     options: list[str], words: str, logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = [] if "-f" in options else ["-f", str(logs)]
-    assert words in failed([*options[:1], *folder, *options[1:]], capsys, zoo_plot.main)
+    assert words in failed(["-f", str(logs), *options], capsys, zoo_plot.main)

@@ -1,4 +1,4 @@
-"""``python -m sb3_saf.plot``: figures of the runs in a log folder."""
+"""``python -m sb3_saf.plot``: learning curves of the runs in a log folder."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
@@ -23,41 +25,30 @@ PROGRAM: Final = "python -m sb3_saf.plot"
 _MOST_NAMED: Final = 2
 #: Value of a parameter that a run leaves to the game.
 _DEFAULT: Final = "default"
-#: Columns of :func:`describe` that are not parameters of the game.
-_NO_LEVELS: Final = ("env", "size", "seed", "run", "changes", "method")
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Make the parser, with one command for each kind of figure."""
-    parser = OneLineParser(prog=PROGRAM, description="Draw the runs in a log folder.")
-    commands = parser.add_subparsers(dest="kind", required=True, parser_class=OneLineParser)
-    kinds = {
-        "curves": "learning curves: mean and 95 %% interval over seeds, in game steps",
-        "levels": "bars of the return against a parameter of the level, mean and 95 %% interval over seeds",
-        "aggregate": "interquartile means and performance profiles with stratified bootstrap intervals (rliable)",
-    }
-    for kind, text in kinds.items():
-        command = commands.add_parser(kind, help=text, description=text.replace("%%", "%"))
-        command.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="where the runs are")
-        command.add_argument("--algos", nargs="+", default=[], help="only these")
-        command.add_argument("--env", nargs="+", default=[], help="only these environments")
-        command.add_argument(
-            "--source",
-            choices=("evaluation", "training"),
-            default="evaluation",
-            help="team returns of evaluation games (default), or of the games that were trained on",
-        )
-        command.add_argument("--title")
-        command.add_argument("-o", "--output", type=Path, required=True, help="a file: .png, .pdf, .svg")
-        if kind == "levels":
-            command.add_argument("--level", default="coordination", help="coordination (default), heterogeneity, ...")
+    """Make the parser."""
+    text = "Draw learning curves of the runs in a log folder: mean and 95 % interval over seeds, in game steps."
+    parser = OneLineParser(prog=PROGRAM, description=text)
+    parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="where the runs are")
+    parser.add_argument("--algos", nargs="+", default=[], help="only these")
+    parser.add_argument("--env", nargs="+", default=[], help="only these environments")
+    parser.add_argument(
+        "--source",
+        choices=("evaluation", "training"),
+        default="evaluation",
+        help="team returns of evaluation games (default), or of the games that were trained on",
+    )
+    parser.add_argument("--title")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="a file: .png, .pdf, .svg")
     return parser
 
 
 def plot(arguments: Sequence[str] | None = None) -> None:
     """Draw a figure and print its path."""
     options = make_parser().parse_args(arguments)
-    require("pandas", "matplotlib", *(["rliable"] if options.kind == "aggregate" else []))
+    require("pandas", "matplotlib")
     with user_errors():
         figure = _draw(options)
     options.output.parent.mkdir(parents=True, exist_ok=True)
@@ -69,15 +60,12 @@ def plot(arguments: Sequence[str] | None = None) -> None:
 def _draw(options: argparse.Namespace) -> Figure:
     import pandas as pd
 
-    from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_levels
-    from sb3_saf.training.statistics import score_matrices
+    from sb3_saf.training.figures import TEAM_RETURN, draw_curves
 
     runs, reasons = [], []
     for run in find_runs(options.log_folder, options.algos, options.env):
         try:
             run.curve(options.source)
-            if options.kind != "curves" and not (run.folder / FINISHED).is_file():
-                raise ValueError(f"{run.folder} is not finished")
             runs.append(run)
         except ValueError as error:
             reasons.append(str(error))
@@ -86,38 +74,15 @@ def _draw(options: argparse.Namespace) -> Figure:
     for reason in reasons:
         print(f"left out: {reason}", file=sys.stderr)
     table = describe(runs)
-    if options.kind == "levels" and options.level not in table:
-        raise unknown_name("parameter", options.level, (column for column in table if column not in _NO_LEVELS))
-    if options.kind == "levels":
-        without = table[options.level].isna() | (table[options.level] == _DEFAULT)
-        for run in table["run"][without]:
-            print(f"left out: {run.folder} states no {options.level}", file=sys.stderr)
-        table = table[~without].reset_index(drop=True)
-    table["setting"] = setting_names(table, [options.level] if options.kind == "levels" else [])
+    table["setting"] = setting_names(table)
     for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
         if changes not in method:
             print(f"{method}: {changes}")
-    are_treasures = "n_treasures" in table and table["n_treasures"].notna().all()
+    are_treasures = all(run.settings.n_treasures is not None for run in table["run"])
     y_label = TEAM_RETURN if are_treasures else "team return"
-    if options.kind == "curves":
-        names = ("method", "seed", "setting")
-        curves = [
-            row.run.curve(options.source).assign(**{k: getattr(row, k) for k in names}) for row in table.itertuples()
-        ]
-        return draw_curves(pd.concat(curves), options.title, panel="setting", y_label=y_label)
-    table["score"] = [run.final_score(options.source) for run in table["run"]]
-    if options.kind == "levels":
-        return draw_levels(table, options.level, options.title, panel="setting", y_label=y_label)
-    if are_treasures:
-        table["score"], y_label = table["score"] / table["n_treasures"], "treasures collected / on the map"
-    else:
-        of_setting = table.groupby("setting")["score"]
-        low, span = of_setting.transform("min"), of_setting.transform("max") - of_setting.transform("min")
-        table["score"], y_label = (
-            (table["score"] - low) / span.where(span > 0, 1.0),
-            "return / range of the setting's runs",
-        )
-    return draw_aggregates(score_matrices(table, "setting"), options.title, y_label)
+    names = ("method", "seed", "setting")
+    curves = [row.run.curve(options.source).assign(**{k: getattr(row, k) for k in names}) for row in table.itertuples()]
+    return draw_curves(pd.concat(curves), options.title, panel="setting", y_label=y_label)
 
 
 # --- runs as a table --------------------------------------------------------------------------------------------------
@@ -152,7 +117,7 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
     :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game;
         ``default`` stands for those that only other runs of the game state. A method's name contains its differences
         from the zoo's settings and from other runs, or a number if these are too many; ``changes`` lists them. Of runs
-        that differ only in their number, the table has the latest
+        that differ only in their number, the table has the latest, of finished ones if there are any
     """
     import pandas as pd
 
@@ -176,8 +141,9 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
         level = {**stated[run.settings.env_id], **run.settings.env_kwargs}
         rows.append({**identity, **level, "run": run, "changes": changes, "method": method})
     table = pd.DataFrame(rows)
-    repeated = [column for column in table.columns if column != "run"]
-    return table.drop_duplicates(repeated, keep="last", ignore_index=True)
+    is_finished = np.array([(run.folder / FINISHED).is_file() for run in runs])
+    last = table.drop(columns="run").astype(str).iloc[np.argsort(is_finished, kind="stable")]
+    return table[~last.duplicated(keep="last").sort_index()].reset_index(drop=True)
 
 
 def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
@@ -206,9 +172,9 @@ def _measured_otherwise(run: Run) -> dict[str, str]:
     return {name: value for name, value in values.items() if value}
 
 
-def setting_names(table: pd.DataFrame, without: Collection[str] = ()) -> list[str]:
+def setting_names(table: pd.DataFrame) -> list[str]:
     """Name the games of each row of :func:`describe`: the environment, and the parameters in which its rows differ."""
-    named = {"method", "changes", "seed", "env", "run", *without}
+    named = {"method", "changes", "seed", "env", "run"}
     columns = [column for column in table.columns if column not in named]
     names: dict[Any, str] = {}
     for env, rows in table.groupby("env", sort=False):
