@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -29,12 +30,19 @@ def start(package: Path) -> tuple[str, bool]:
 
 
 def test_kernels_are_compiled_once_and_anew_after_a_change(tmp_path: Path) -> None:
-    package = shutil.copytree(PACKAGE, tmp_path / "hecogrid_envs")
-    start(package)  # loads what other tests have compiled; where there is none, compiles
-    with (package / "tasks" / "team_support.py").open("a") as file:
-        file.write("# Another condition.\n")
+    package = shutil.copytree(PACKAGE, tmp_path / "hecogrid_envs", ignore=shutil.ignore_patterns("__pycache__"))
+    edit(package / "core" / "play.py", r"(_key = sources).*?(?=\n    return play\n)", r"\1")  # compiles in a second
+    edit(package / "batch.py", r"(_SECONDS_WITHOUT_A_WORD: Final) = [\d.]+", r"\1 = 0.0")
     assert start(package) == ("0", True)
     assert start(package)[0] == "1"
+    edit(package / "tasks" / "team_support.py", r"\Z", "# Another condition.\n")
+    assert start(package)[0] == "0"
+
+
+def edit(path: Path, pattern: str, replacement: str) -> None:
+    text, count = re.subn(pattern, replacement, path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert count == 1
+    path.write_text(text, encoding="utf-8")
 
 
 LATER = """

@@ -213,7 +213,10 @@ def worker_of(driver: int) -> int:
 
 def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> None:
     """Cells trained for one experiment are only tested for another. An untrained QPLEX would act at random."""
-    one, short = Selection((0,), ("qplex",), ("TeamSupport-v0",)), replace(SMOKE, overrides={"game_steps": 40})
+    one, short = (
+        Selection((0,), ("qplex",), ("TeamSupport-v0",)),
+        replace(SMOKE, overrides={"game_steps": 40}, episodes=8),
+    )
     run_inline(tmp_path / "both", one, "coordination", short)
     summary, engine = run_inline(tmp_path / "both", one, "ood-coordination", short)
     assert (summary.finished, engine.with_model) == (1, [True])
@@ -236,7 +239,7 @@ def job_in(folder: Path, method: str = "ippo", tests: int = 1, **options: Any) -
 
 
 def test_tensorboard_of_a_cell_has_the_inside_of_its_policy(tmp_path: Path) -> None:
-    short = replace(SMOKE, overrides={"game_steps": 40})
+    short = replace(SMOKE, overrides={"game_steps": 40}, episodes=8)
     run_job(job_in(tmp_path / "cell", config=short, tensorboard=True))
     (file,) = (tmp_path / "cell" / "result").rglob("events.*")
     assert "critic/explained_variance" in EventAccumulator(str(file)).Reload().Tags()["scalars"]

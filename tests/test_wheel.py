@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import tarfile
@@ -17,7 +16,7 @@ from zipfile import ZipFile
 
 import pytest
 
-from tests.environments import make_environment, shell, start
+from tests.environments import make_environment, shell
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("hecogrid_envs", "sb3_saf", "zoo_configs")
@@ -134,17 +133,7 @@ def folder(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.timeout(1200)
 def test_programs_and_the_commands_that_they_print_run_without_activation(folder: Path) -> None:
-    """Numbers are small: 400 steps of training, one cell of an experiment."""
-    train = ".venv/bin/python -m sb3_saf.train --algo saf --env TeamSupport-v0 --size smoke --eval-freq -1"
-    with start(train, folder) as process:
-        assert process.stdout is not None
-        next(line for line in process.stdout if line.startswith(" 10 % of"))
-        process.send_signal(signal.SIGINT)
-        printed = process.stdout.read()
-    assert process.returncode == 130
-    shell(re.findall("go on from there with: (.*)", printed)[0], folder)
-    assert (folder / "logs" / "saf" / "TeamSupport-v0_1" / "TeamSupport-v0.zip").is_file()
-
+    """One cell of an experiment, of 40 game steps; workers find the package, too."""
     run = ".venv/bin/python -m sb3_saf.experiments run coordination --size smoke -n 40 --episodes 2"
     printed = shell(f"{run} --methods ippo --tasks TeamSupport --levels 1 --seeds 0", folder)
     shell(re.findall("next: (.*)", printed)[0], folder)
