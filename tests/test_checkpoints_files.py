@@ -166,7 +166,7 @@ def test_another_format_says_which_version_wrote_it(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(trees, "package_version", lambda: "7.5.0")
     put(folder, 1, 20)
     monkeypatch.undo()
-    with pytest.raises(CheckpointError, match=r"checkpoint-000000000020.*format 1, got 9.*sb3_saf 7\.5\.0"):
+    with pytest.raises(CheckpointError, match=r"checkpoint-000000000020.*format 2, got 9.*sb3_saf 7\.5\.0"):
         folder.newest()
 
 

@@ -150,7 +150,7 @@ def _flat(nested: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 #: None, bool, int, float, str, arrays, tensors, and lists, tuples, deques and dicts of these.
 Tree = Any
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 #: First entries of the pairs that stand for NumPy's arrays and numbers; the second one is a tensor.
 _ARRAY, _NUMBER = "numpy.ndarray", "numpy.generic"
 _DIGEST_BYTES: Final = hashlib.sha256().digest_size
