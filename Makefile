@@ -30,8 +30,7 @@ test: $(INSTALLED) ## run the tests
 	@$(RUN) pytest -n $(JOBS) --dist loadscope --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, notebooks, tests
-	@$(MAKE) --no-print-directory -j $(JOBS) format-check lint types docs
-	@$(MAKE) --no-print-directory notebooks
+	@$(MAKE) --no-print-directory --output-sync -j $(JOBS) notebooks format-check lint types docs
 	@$(MAKE) --no-print-directory test
 
 coverage: $(INSTALLED) ## run the tests and print their branch coverage
