@@ -171,7 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     failed = False
     with ThreadPoolExecutor(options.jobs) as pool:
-        for outcome in pool.map(tried, paths):
+        for outcome in pool.map(tried, reversed(paths)):  # the longest ones are at the end
             failed |= isinstance(outcome, NotebookError)
             print(outcome, file=sys.stderr if isinstance(outcome, NotebookError) else sys.stdout, flush=True)
     return int(failed)
