@@ -579,7 +579,10 @@ def test_a_check_sees_edited_numbers(undisturbed: Path, tmp_path: Path, capsys: 
 
 
 class BoundedEnv(Game):
-    """Agents are paid their actions: up to 1, and up to 10."""
+    """Agents are paid their actions: up to 1, and up to 10. Treasures are no share of them."""
+
+    def __init__(self, n_treasures: int = 3) -> None:
+        self.n_treasures = n_treasures
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         return spaces.Box(0, 1 if agent == "a" else 10, (1,), np.float32)
@@ -590,5 +593,6 @@ class BoundedEnv(Game):
 
 def test_random_teams_draw_within_the_bounds_of_each_agent(tmp_path: Path) -> None:
     cell = Cell(RANDOM, "tests.test_experiments_run:BoundedEnv", Level.of(), 0, (Level.of(),))
-    (played,) = play(Job(cell, RunConfig("smoke", episodes=128)), Level.of(), None, tmp_path).plays
-    np.testing.assert_allclose(played.agent_means, [4 * 0.5, 4 * 5], rtol=0.1)
+    result = play(Job(cell, RunConfig("smoke", episodes=128)), Level.of(n_treasures=7), None, tmp_path)
+    np.testing.assert_allclose(result.plays[0].agent_means, [4 * 0.5, 4 * 5], rtol=0.1)
+    assert result.max_return is None  # only HECOGrid's is its number of treasures

@@ -37,8 +37,9 @@ def struck(folder: Path, algo: str, *options: str, error: type[BaseException] = 
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SeededEvalCallback, "_evaluate", strike)
-        with pytest.raises(SystemExit if error is KeyboardInterrupt else error):
+        with pytest.raises(SystemExit if error is KeyboardInterrupt else error) as ended:
             train(folder, algo, "--seed", "3", *options)
+    assert error is not KeyboardInterrupt or ended.value.args == (130,)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -235,14 +235,6 @@ def test_settings_survive_a_file() -> None:
     assert saved_settings(settings.as_dict(), {"coordination": 3}).env_kwargs["coordination"] == 3
     with pytest.raises(ValueError, match="hyperparams is missing"):
         saved_settings({key: value for key, value in settings.as_dict().items() if key != "hyperparams"})
-
-
-def test_only_hecogrids_returns_are_shares_of_treasures() -> None:
-    assert load_settings("saf", "TeamSupport-v0", "smoke", {"n_treasures": 7}).n_treasures == 7
-    assert (
-        replace(load_settings("saf", "tests.toy_envs:CounterEnv", "smoke"), env_kwargs={"n_treasures": 7}).n_treasures
-        is None
-    )
 
 
 def test_no_run_has_the_seed_of_an_evaluation() -> None:
