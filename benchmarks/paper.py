@@ -51,9 +51,10 @@ RAW: Final = ROOT / "results" / "paper"
 PAGES: Final = (ROOT / "results" / "README.md", RAW / "README.md", ROOT / "docs" / "algorithms" / "memory.md")
 #: Tests at other levels than that of the training.
 OTHER_LEVELS: Final = ("ood-coordination", "ood-heterogeneity")
-#: The same for SAF without its parts, and its methods.
+#: The same for SAF without its parts.
 OTHER_LEVELS_PARTS: Final = "ood-ablation"
-PARTS: Final = ("saf", "saf-no-pool", "saf-paper-no-pool")
+#: SAF without its parts and in the paper's form, and MAPPO of its table, in settings of the grid.
+PARTS: Final = "parts"
 #: The experiments of the grid; others have settings of their own.
 GRID: Final = ("coordination", "heterogeneity", "joint", *OTHER_LEVELS)
 #: With a GRU, in settings of the grid.
@@ -72,6 +73,15 @@ WORDS: Final = {
     **{name: method.words for name, method in METHODS.items()},
     **{f"{name}-gru": f"{METHODS[name].words}, GRU" for name in ("saf", "mappo", "ippo")},
 }
+#: What the parts are worth: first minus second.
+PAIRS: Final = (
+    ("saf", "saf-no-pool"),
+    ("saf", "saf-no-ks"),
+    ("saf", "saf-paper"),
+    ("saf-paper", "saf-paper-no-pool"),
+    ("saf-no-pool", "saf-paper-no-pool"),
+    ("mappo", "mappo-separate"),
+)
 _COLUMNS: Final = ["task", "level"]
 #: Share of the treasures below which a setting says nothing about methods.
 _FLOOR: Final = 0.01
@@ -181,8 +191,7 @@ def answer(frames: Frames) -> str:
                 f"- SAF minus {WORDS[other]}: **{show(found.estimate)} % of the treasures** over {found.n} games: "
                 f"{found.verdict}. SAF collected more in {more} of {len(pairs)} pairs of runs, less in {less}."
             )
-    above = tests[tests.groupby(_COLUMNS)["score"].transform("max") >= _FLOOR]
-    found = difference(above, "saf", "mappo")
+    found = difference(_above_floor(tests), "saf", "mappo")
     means = shares(tests, "saf", "mappo").groupby("setting")["difference"].mean()
     if found is not None:
         lines.append(
@@ -280,6 +289,26 @@ def other_table(names: Iterable[str]) -> str:
             text = "; ".join(f"{WORDS.get(str(name), name)} {100 * of.mean():.1f} ({len(of)})" for name, of in scores)
             body.append([name, f"{task}, {level}", text])
     return table(["experiment", "setting", "% of the treasures (seeds)"], body)
+
+
+def parts_table(tests: pd.DataFrame) -> str:
+    """Return what SAF's parts and shared networks are worth in the games where some method collects anything."""
+    body = []
+    for first, second in PAIRS:
+        pairs = by_game(_above_floor(tests), first, second)
+        found = pooled(pairs)
+        if found is not None:
+            games = pairs.groupby("setting")["difference"].mean()
+            by_task = games.groupby(games.index.str.split().str[0]).mean()
+            cells = (f"{by_task[task]:+.1f}" if task in by_task else "" for task in dict.fromkeys(tests["task"]))
+            body.append([f"{WORDS[first]}, minus {WORDS[second]}", show(found.estimate), str(found.n), *cells])
+    return table(["% of the treasures", "all games", "games", *dict.fromkeys(tests["task"])], body)
+
+
+def _above_floor(tests: pd.DataFrame) -> pd.DataFrame:
+    """Return the tests of the settings where some method of the grid collects anything."""
+    best = tests["score"].where(tests["method"].isin(MAIN)).groupby([tests[name] for name in _COLUMNS])
+    return tests[best.transform("max") >= _FLOOR]
 
 
 def factorial_table(names: Iterable[str]) -> str:
@@ -425,10 +454,11 @@ def pages() -> dict[Path, str]:
     everything = pd.concat([read(name).tests.assign(block=name) for name in names])
     everything = everything.drop_duplicates([*_RUN, "level"])
     factorial = [name for name in names if name.startswith(FACTORIAL)]
-    others = [name for name in names if name not in (*GRID, MEMORY, OTHER_LEVELS_PARTS, *factorial)]
+    others = [name for name in names if name not in (*GRID, MEMORY, PARTS, OTHER_LEVELS_PARTS, *factorial)]
     frames = grid()
     tests = frames.tests
     unseen = other_levels()
+    parts = read(PARTS).tests.query("game_steps > 0")
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
         "answer": answer(frames),
@@ -438,7 +468,11 @@ def pages() -> dict[Path, str]:
         "losses": losses(tests, pd.read_csv(RAW / "scripted.csv")),
         "settings": settings_table(tests),
         "unseen": settings_table(unseen),
-        "unseen_parts": settings_table(read(OTHER_LEVELS_PARTS).tests.query("game_steps > 0"), PARTS),
+        "unseen_parts": settings_table(
+            read(OTHER_LEVELS_PARTS).tests.query("game_steps > 0"), ("saf", "saf-no-pool", "saf-paper-no-pool")
+        ),
+        "parts": parts_table(pd.concat([tests, parts])),
+        "parts_settings": settings_table(parts, list(dict.fromkeys(parts["method"]))),
         "others": other_table(others),
         "factorial": factorial_table(factorial),
         "elsewhere": elsewhere(pd.read_csv(RAW / "other_processor.csv"), everything.query("level == train_level")),

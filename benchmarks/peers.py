@@ -59,7 +59,7 @@ class Peer(NamedTuple):
     """
     A program of others and what it is trained on.
 
-    :param task: our id
+    :param task: our id, with the parameters of the game that the program sets
     :param program: name in the table
     :param kind: key of ``PROGRAMS``
     :param own_task: their name of the task
@@ -107,7 +107,7 @@ PEERS: Final = (
         Peer(f"smax/{battle}", "JaxMARL's IPPO", "jaxmarl", battle, "ippo_rnn_smax", 10_000_000)
         for battle in ("2s3z", "3s_vs_5z")
     ),
-    Peer("vmas/balance", "BenchMARL's MAPPO", "benchmarl", "BALANCE", "Mappo", 100_000),
+    Peer("vmas/balance n_agents:4", "BenchMARL's MAPPO", "benchmarl", "BALANCE", "Mappo", 100_000),
     Peer(
         "lbf/Foraging-8x8-2p-3f-v3",
         "EPyMARL's MAPPO",

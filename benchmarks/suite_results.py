@@ -32,6 +32,10 @@ PAGE: Final = Path("results", "suites.md")
 RAW: Final = Path("results", "field")
 
 
+#: Shapes the rewards of training only.
+_SHAPING: Final = "reward_shaping_steps:"
+
+
 class Task(NamedTuple):
     """
     A row of the table.
@@ -40,7 +44,8 @@ class Task(NamedTuple):
     :param game_steps: of one training, equal for all methods
     :param methods: that are trained, besides a random team
     :param settings: ``name:value`` in the place of those in ``zoo_configs``
-    :param params: ``name:value`` of the environment
+    :param params: ``name:value`` of the environment, in training only or in every game
+    :param folder: name of its experiment and folder, if not that of the environment
     """
 
     env_id: str
@@ -48,11 +53,17 @@ class Task(NamedTuple):
     methods: tuple[str, ...] = METHODS
     settings: tuple[str, ...] = ()
     params: tuple[str, ...] = ()
+    folder: str = ""
 
     @property
     def name(self) -> str:
         """Return the name of its experiment and folder."""
-        return self.env_id.replace("/", "-")
+        return self.folder or self.env_id.replace("/", "-")
+
+    @property
+    def game(self) -> str:
+        """Return the environment with the parameters of every game."""
+        return " ".join([self.env_id, *(param for param in self.params if not param.startswith(_SHAPING))])
 
 
 _KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
@@ -62,9 +73,13 @@ TASKS: Final = (
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
     Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000),
     Task("vmas/balance", 10_000_000),
+    *(
+        Task("vmas/balance", game_steps, params=("n_agents:4",), folder=f"vmas-balance-4-agents-{game_steps}")
+        for game_steps in (100_000, 1_000_000)  # BenchMARL's game
+    ),
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
     Task("lbf/Foraging-15x15-4p-3f-v3", 5_000_000),
-    *(Task(f"overcooked/{layout}", 5_000_000, params=("reward_shaping_steps:2500000",)) for layout in _KITCHENS),
+    *(Task(f"overcooked/{layout}", 5_000_000, params=(f"{_SHAPING}2500000",)) for layout in _KITCHENS),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     *(
         Task(f"smax/{battle}", 10_000_000, settings=("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0"))
@@ -84,9 +99,10 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
 def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
     """Yield results of others' trainings, at least half and at most twice as long, and notes with method and source."""
     for one in references(task.env_id):
-        if not one.is_own and not one.params and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
+        game = " ".join([one.task, *(f"{name}:{value}" for name, value in one.params.items())])
+        if not one.is_own and game == task.game and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
             yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
-    here = baselines[(baselines["task"] == task.env_id) & (baselines["game_steps"] >= task.game_steps / 2)]
+    here = baselines[(baselines["task"] == task.game) & (baselines["game_steps"] >= task.game_steps / 2)]
     for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):
         yield _over_seeds(trainings["return"]), f"{program} after {game_steps:,} game steps: `{BASELINES.name}`"
 
@@ -113,7 +129,7 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
             notes += [] if note in notes else [note]
             others.append(f"{result} ({notes.index(note) + 1})")
         if not (folder / task.name).is_dir():
-            missing.append(f"`{task.env_id}` ({'; '.join(others) or 'nothing is published'})")
+            missing.append(f"`{task.game}` ({'; '.join(others) or 'nothing is published'})")
             continue
         tests = read_results(folder, task.name).tests
         commits |= set(tests["commit"])
@@ -123,7 +139,7 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
             if here.empty:
                 continue
             won = "" if here["success_rate"].isna().any() else f", {here['success_rate'].mean():.0%} won"
-            cells = [f"`{task.env_id}`", f"{here['game_steps'].max():,}", NAMED[method].words.partition(",")[0]]
+            cells = [f"`{task.game}`", f"{here['game_steps'].max():,}", NAMED[method].words.partition(",")[0]]
             cells += [
                 f"**{_over_seeds(here['return_mean'])}**{won}",
                 "; ".join(others),

@@ -367,6 +367,10 @@ def test_games_of_vmas_begin_again_one_by_one() -> None:
             change = np.abs(rows["obs"][going] - last["obs"][going])[:, :-1]  # the last is an angle, which may wrap
             assert change.max() < 0.5, "others go on"
     assert any(t < 99 and not truncated for t, truncated in ends)
+    venv = rows_of("vmas/multi_give_way", 1, seed=1)  # BenchMARL's time limit is not 100 everywhere
+    venv.reset()
+    still = np.zeros((venv.num_envs, 2), dtype=np.float32)
+    assert [venv.step(still)[2].all() for _ in range(200)].index(True) == 199
 
 
 @needs_vmas

@@ -21,8 +21,6 @@ with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array, TeamSpaces
 
-#: Game steps after which BenchMARL stops an episode.
-_MAX_STEPS: Final = 100
 _ONE_AGENT: Final = "simple"
 #: Text of VMAS's warning about unknown parameters of a scenario.
 _UNUSED: Final = "not used by the scenario"
@@ -158,7 +156,7 @@ def vec_env(
     state: bool = False,
     render_mode: str | None = None,
     stagger: bool = False,
-    max_steps: int | None = _MAX_STEPS,
+    max_steps: int | None = None,
     continuous_actions: bool = True,
     device: str = "cpu",
     **params: Any,
