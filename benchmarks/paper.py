@@ -114,14 +114,18 @@ def grid() -> Frames:
     """Return the raw data of the grid at levels of training, each cell once, in the order of tasks and levels."""
     frames = [read(name) for name in GRID]
     tests = pd.concat([frame.tests.query("train_level == level") for frame in frames])
-    tests = tests.drop_duplicates(["method", *_COLUMNS, "seed"])
+    tests = _in_order(tests.drop_duplicates(["method", *_COLUMNS, "seed"]))
     curves = pd.concat([frame.curves for frame in frames]).drop_duplicates(["method", *_COLUMNS, "seed", "game_steps"])
-    tasks = ["TeamSupport", "TeamTogether", "KeyForTreasure"]
-    tests["task"] = pd.Categorical(tests["task"], tasks)
-    tests = tests.sort_values(["task", "coordination", "heterogeneity"], kind="stable").astype({"task": str})
     group = np.where(tests["heterogeneity"] == 1, "coordination", "joint")
     tests["group"] = np.where((tests["heterogeneity"] > 1) & (tests["coordination"] == 1), "heterogeneity", group)
     return Frames(tests, curves)
+
+
+def _in_order(tests: pd.DataFrame) -> pd.DataFrame:
+    """Return tests in the order of tasks and levels."""
+    tasks = pd.Categorical(tests["task"], ["TeamSupport", "TeamTogether", "KeyForTreasure"])
+    tests = tests.assign(task=tasks).sort_values(["task", "coordination", "heterogeneity"], kind="stable")
+    return tests.astype({"task": str})
 
 
 def other_levels() -> pd.DataFrame:
@@ -301,14 +305,13 @@ def parts_table(tests: pd.DataFrame) -> str:
             games = pairs.groupby("setting")["difference"].mean()
             by_task = games.groupby(games.index.str.split().str[0]).mean()
             cells = (f"{by_task[task]:+.1f}" if task in by_task else "" for task in dict.fromkeys(tests["task"]))
-            body.append([f"{WORDS[first]}, minus {WORDS[second]}", show(found.estimate), str(found.n), *cells])
-    return table(["% of the treasures", "all games", "games", *dict.fromkeys(tests["task"])], body)
+            body.append([WORDS[first], WORDS[second], show(found.estimate), str(found.n), *cells])
+    return table(["", "minus", "all games", "games", *dict.fromkeys(tests["task"])], body)
 
 
 def _above_floor(tests: pd.DataFrame) -> pd.DataFrame:
     """Return the tests of the settings where some method of the grid collects anything."""
-    best = tests["score"].where(tests["method"].isin(MAIN)).groupby([tests[name] for name in _COLUMNS])
-    return tests[best.transform("max") >= _FLOOR]
+    return tests[tests.groupby(_COLUMNS)["score"].transform("max") >= _FLOOR]
 
 
 def factorial_table(names: Iterable[str]) -> str:
@@ -458,7 +461,7 @@ def pages() -> dict[Path, str]:
     frames = grid()
     tests = frames.tests
     unseen = other_levels()
-    parts = read(PARTS).tests.query("game_steps > 0")
+    parts = _in_order(read(PARTS).tests.query("game_steps > 0"))
     pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
     blocks = {
         "answer": answer(frames),
@@ -472,7 +475,7 @@ def pages() -> dict[Path, str]:
             read(OTHER_LEVELS_PARTS).tests.query("game_steps > 0"), ("saf", "saf-no-pool", "saf-paper-no-pool")
         ),
         "parts": parts_table(pd.concat([tests, parts])),
-        "parts_settings": settings_table(parts, list(dict.fromkeys(parts["method"]))),
+        "parts_settings": settings_table(parts, list(dict.fromkeys(method for pair in PAIRS for method in pair))),
         "others": other_table(others),
         "factorial": factorial_table(factorial),
         "elsewhere": elsewhere(pd.read_csv(RAW / "other_processor.csv"), everything.query("level == train_level")),

@@ -14,14 +14,15 @@ from gymnasium import spaces
 from pettingzoo import ParallelEnv
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
 
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array
-from sb3_saf.teams.vec_env import episode_value, find_n_agents, team_dones
+from sb3_saf.teams.vec_env import episode_value, find_n_agents, layers, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -305,7 +306,7 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
     :param model: an algorithm or a policy; anything else passes
     :param same_size: whether the number of agents must be equal, too: critics depend on it, actors do not, unless they
         read the agent's index
-    :raises ValueError: if observations, actions or, where it matters, the number of agents differ
+    :raises ValueError: if observations, actions, normalisation or, where it matters, the number of agents differ
     """
     policy, n_agents = getattr(model, "policy", model), _team_size(env)
     if not isinstance(policy, TeamRowsPolicy):
@@ -325,6 +326,13 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
             f"expected games like those on which {name} was trained, with {expected}, got {got}; make them as for its "
             "training" + ("" if not is_other_size else f", with {trained.n_agents} agents")
         )
+    games = model.get_env() if isinstance(model, BaseAlgorithm) else None
+    if games is not None and (there := _n_normalized(games)) != (here := _n_normalized(env)):
+        raise ValueError(
+            f"expected observations normalised as in the training of {name}, by {there} VecNormalize, got {here}; wrap "
+            "the games alike, with training=False, and copy the statistics: "
+            "stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
+        )
     agent = space.spaces.get(AGENT_KEY) if isinstance(space, spaces.Dict) else None
     names = getattr(agent, "names", None)
     if policy.acts_by_index and names and trained.names and names != trained.names:
@@ -332,6 +340,10 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
             f"expected the agents in the order of the games on which {name} was trained, {list(trained.names)}, since "
             f"its actors read who acts, got {list(names)}; list possible_agents in that order"
         )
+
+
+def _n_normalized(env: VecEnv) -> int:
+    return sum(isinstance(layer, VecNormalize) and layer.norm_obs for layer in layers(env))
 
 
 def evaluate_team(

@@ -235,10 +235,11 @@ def test_the_kitchen() -> None:
 
 
 @needs_jaxmarl
-def test_soups_alone_are_evaluated() -> None:
+@pytest.mark.parametrize("env_id", ["overcooked/cramped_room", "jaxmarl/overcooked"])
+def test_soups_alone_are_evaluated(env_id: str) -> None:
     """A cook puts onions into the pot, which is rewarded only in training: 3 for each, with this weight."""
     shaped = {"reward_shaping": 1.0, "reward_shaping_steps": 1_000_000, "max_steps": 11}
-    settings = load_settings("ippo", "overcooked/cramped_room", "smoke", env_kwargs=shaped)
+    settings = load_settings("ippo", env_id, "smoke", env_kwargs=shaped)
     left, right, up, interact = 3, 2, 0, 5
     gained = []
     for evaluation in (False, True):
@@ -248,6 +249,21 @@ def test_soups_alone_are_evaluated() -> None:
         gained.append(np.sum(steps, axis=0))
         assert env.step(np.array([4, 4] * 2))[2].tolist() == [False] * 4, "max_steps holds for both"
     np.testing.assert_allclose(gained, [[3, 0, 3, 0], [0, 0, 0, 0]], rtol=1e-4)
+
+
+@needs_jaxmarl
+def test_arguments_are_those_of_the_moment() -> None:
+    """A list that is changed after a game was made with it makes another game."""
+    payoffs, actions = [[1, 1, -2], [1, 1, -2]], np.random.default_rng(0).integers(0, 5, (40, 4))
+    paid = []
+    for penalty in (-2, -50):
+        payoffs[0][2] = payoffs[1][2] = penalty
+        venv = rows_of("jaxmarl/coin_game", 2, payoff_matrix=payoffs)
+        venv.reset()
+        paid.append(np.min([venv.step(row)[1].min() for row in actions]))
+    assert paid[0] >= -2 and paid[1] <= -49
+    with pytest.raises(ValueError, match="expected no layout, which the task's name sets; choose another task"):
+        make_team_env("overcooked/cramped_room", layout="coord_ring")
 
 
 @needs_jaxmarl

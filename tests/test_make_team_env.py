@@ -14,7 +14,7 @@ from gymnasium import spaces
 from sb3_contrib import TRPO, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs, VecFrameStack
-from supersuit import agent_indicator_v0, clip_reward_v0, frame_stack_v1
+from supersuit import agent_indicator_v0, clip_reward_v0, dtype_v0, frame_stack_v1, normalize_obs_v0
 from torch import nn
 
 import hecogrid_envs
@@ -117,6 +117,8 @@ def test_wrappers_that_make_tile_codes_plain_numbers_are_refused() -> None:
         with pytest.raises(ValueError, match=r"leave tile codes as they are, .* give the game observation='rgb'"):
             make_team_env(lambda wrap=wrap: wrap(game(observation="tiles")))
         make_team_env(lambda wrap=wrap: wrap(game())).close()
+    with pytest.raises(ValueError, match="leave tile codes as they are"):
+        make_team_env(lambda: normalize_obs_v0(dtype_v0(game(observation="tiles"), np.float32)))
     make_team_env(lambda: clip_reward_v0(game(observation="tiles"))).close()
     rows = make_team_env("TeamSupport", 2, **SMALL).venv
     with pytest.raises(ValueError, match="leave tile codes as they are"):

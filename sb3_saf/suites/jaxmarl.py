@@ -13,6 +13,8 @@ from sb3_saf.suites.registry import Suite
 
 #: Requirements of all suites of JaxMARL.
 JAXMARL: Final = ('jaxmarl>=0.2,<0.3; python_version >= "3.11"', 'jax>=0.4.25; python_version >= "3.11"')
+#: Shaped rewards are for training only.
+TRAINING_PARAMS: Final = ("reward_shaping", "reward_shaping_steps")
 
 
 def _tasks() -> list[str]:
@@ -38,6 +40,7 @@ SUITE: Final = Suite(
     vec_env=_games,
     competitive=(
         "SMAX", "MPE_simple_adversary_*", "MPE_simple_crypto_*", "MPE_simple_push_*", "MPE_simple_tag_*",
-        "MPE_simple_world_comm_*", "coin_game",
+        "MPE_simple_world_comm_*", "MPE_simple_facmac_*", "coin_game",
     ),
+    training_params=TRAINING_PARAMS,
 )  # fmt: skip

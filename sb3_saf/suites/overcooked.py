@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from sb3_saf.suites.jaxmarl import JAXMARL
+from sb3_saf.suites.jaxmarl import JAXMARL, TRAINING_PARAMS
 from sb3_saf.suites.registry import Suite
 
 
@@ -37,5 +37,5 @@ SUITE: Final = Suite(
     examples=("cramped_room",),
     vec_env=_games,
     team_return="mean",
-    training_params=("reward_shaping", "reward_shaping_steps"),
+    training_params=TRAINING_PARAMS,
 )

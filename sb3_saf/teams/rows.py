@@ -365,12 +365,12 @@ def check_codes_are_kept(seen: spaces.Space[Any], inner: Iterable[spaces.Space[A
 
     :param seen: own observations behind the wrappers
     :param inner: own observations of what they wrap
-    :raises ValueError: if an inner space has an ``atlas``, and the outer one its codes without it
+    :raises ValueError: if an inner space has an ``atlas``, and the outer one its shape or range without it
     """
     if not isinstance(seen, spaces.Box) or hasattr(seen, "atlas"):
         return
     coded = (space for space in inner if isinstance(space, spaces.Box) and hasattr(space, "atlas"))
-    if any(space.high.max() == seen.high.max() for space in coded):
+    if any(space.shape == seen.shape or space.high.max() == seen.high.max() for space in coded):
         raise ValueError(
             f"expected wrappers that leave tile codes as they are, got {seen} without their atlas; give the game "
             "observation='rgb', or leave the wrapper out"

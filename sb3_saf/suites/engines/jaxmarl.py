@@ -11,10 +11,12 @@ import contextlib
 import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from functools import cached_property, lru_cache, partial
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
+import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -484,21 +486,17 @@ def registered() -> list[str]:
 
 
 class _Params:
-    """Arguments of an environment, compared by value; arrays are compared by identity."""
+    """Arguments of an environment as they are now, compared by value."""
 
     def __init__(self, params: Mapping[str, Any]) -> None:
-        self.params = dict(params)
-        self._key = tuple(sorted((name, _identity(value)) for name, value in self.params.items()))
+        self.params = deepcopy(dict(params))
+        self._key = tuple((name, cloudpickle.dumps(value)) for name, value in sorted(params.items()))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Params) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
-
-
-def _identity(value: Any) -> str:
-    return repr(value) if isinstance(value, (bool, int, float, str, tuple, type(None))) else str(id(value))
 
 
 @lru_cache(_N_KEPT)
@@ -529,8 +527,11 @@ def vec_env(
     :param reward_shaping: weight of the shaped rewards, if the environment has any
     :param reward_shaping_steps: game steps, summed over games, over which that weight decreases to 0; None for never
     :param fixed: arguments of the environment that the task sets
-    :raises ValueError: if the state, picture or reward is missing, or the environment has no teams of named agents
+    :raises ValueError: if the state, picture or reward is missing, the environment has no teams of named agents, or the
+        task sets an argument
     """
+    if params.keys() & (fixed or {}).keys():
+        raise ValueError(f"expected no {' or '.join(fixed or {})}, which the task's name sets; choose another task")
     programs = _programs(name, _Params({**params, **(fixed or {})}), state)
     if reward_shaping and programs.rules.extra_reward is None:
         raise ValueError(f"{name} has no rewards for steps on the way, got reward_shaping={reward_shaping}")
