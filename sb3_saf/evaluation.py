@@ -329,8 +329,8 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
     games = model.get_env() if isinstance(model, BaseAlgorithm) else None
     if games is not None and (there := _n_normalized(games)) != (here := _n_normalized(env)):
         raise ValueError(
-            f"expected observations normalised as in the training of {name}, by {there} VecNormalize, got {here}; wrap "
-            "the games alike, with training=False, and copy the statistics: "
+            f"expected observations normalised as in the training of {name}, by {there} VecNormalize with statistics, "
+            f"got {here}; wrap the games alike, with training=False, and copy the statistics: "
             "stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
         )
     agent = space.spaces.get(AGENT_KEY) if isinstance(space, spaces.Dict) else None
@@ -343,7 +343,9 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
 
 
 def _n_normalized(env: VecEnv) -> int:
-    return sum(isinstance(layer, VecNormalize) and layer.norm_obs for layer in layers(env))
+    """Return the number of VecNormalize that normalise observations, and have seen any."""
+    found = [layer.obs_rms for layer in layers(env) if isinstance(layer, VecNormalize) and layer.norm_obs]
+    return sum(min(one.count for one in (rms.values() if isinstance(rms, dict) else [rms])) >= 1 for rms in found)
 
 
 def evaluate_team(

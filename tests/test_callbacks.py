@@ -176,8 +176,9 @@ def test_every_evaluation_has_the_statistics_of_training(tmp_path: Path) -> None
         ValueError, match="as many VecNormalize in the games of evaluation as in those of training, 1, got 0"
     ):
         ppo(normalised(0, True)).learn(ROLLOUT, plain)
-    with pytest.raises(ValueError, match=r"as in the training of the model, by 1 VecNormalize, got 0; .*sync"):
-        sb3_saf.evaluate_team(ppo(games), plain.eval_env)
+    for other in (plain.eval_env, normalised(1, False)):  # without, and without its statistics
+        with pytest.raises(ValueError, match=r"of the model, by 1 VecNormalize with statistics, got 0; .*sync"):
+            sb3_saf.evaluate_team(ppo(games), other)
 
 
 class SometimesWon(CounterEnv):
