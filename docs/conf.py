@@ -49,8 +49,17 @@ nitpick_ignore_regex = [
     (r"py:.*", r"(?!sb3_saf\.[A-Z]|hecogrid_envs\.[A-Z]).*"),
 ]
 
+#: Folders outside this one whose pages are copied into it, and their names here.
+COPIED = {"notebooks": "tutorials", "results": "results"}
 #: A line of this form is replaced by the docstring of the named class, which is Markdown.
 DOCSTRING_LINE = "%docstring "
+
+
+def _link_copies(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Links to ``results`` and ``notebooks``, which work in the repository, lead to the copies that are built."""
+    source[0] = re.sub(
+        r"(\]\((?:\.\./)*)\.\./(results|notebooks)/", lambda link: f"{link[1]}{COPIED[link[2]]}/", source[0]
+    )
 
 
 def _insert_docstrings(app: Sphinx, docname: str, source: list[str]) -> None:
@@ -81,7 +90,7 @@ def _drop_markdown_docstrings(
 def _copy_pages() -> None:
     """Copy the pages that live outside this folder into it: Sphinx reads no others."""
     docs = ROOT / "docs"
-    for folder, pages in (("notebooks", "tutorials"), ("results", "results")):
+    for folder, pages in COPIED.items():
         shutil.rmtree(docs / pages, ignore_errors=True)  # pages that are gone
         shutil.copytree(ROOT / folder, docs / pages, ignore=shutil.ignore_patterns("*.py*", "__*"))
         for copied in [*(docs / pages).rglob("*.md"), *(docs / pages).rglob("*.ipynb")]:
@@ -93,7 +102,8 @@ def _copy_pages() -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Copy pages and register the two functions above."""
+    """Copy pages and register the functions above."""
     _copy_pages()
+    app.connect("source-read", _link_copies)
     app.connect("source-read", _insert_docstrings)
     app.connect("autodoc-process-docstring", _drop_markdown_docstrings)
