@@ -100,7 +100,8 @@ def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
     """Yield results of others' trainings, at least half and at most twice as long, and notes with method and source."""
     for one in references(task.env_id):
         game = " ".join([one.task, *(f"{name}:{value}" for name, value in one.params.items())])
-        if not one.is_own and game == task.game and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
+        is_elsewhere = not one.is_own and BASELINES.name not in one.source
+        if is_elsewhere and game == task.game and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
             yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
     here = baselines[(baselines["task"] == task.game) & (baselines["game_steps"] >= task.game_steps / 2)]
     for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):
