@@ -327,11 +327,12 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
             "training" + ("" if not is_other_size else f", with {trained.n_agents} agents")
         )
     games = model.get_env() if isinstance(model, BaseAlgorithm) else None
-    if games is not None and (there := _n_normalized(games)) != (here := _n_normalized(env)):
+    there, here = ([] if one is None else _normalizers(one) for one in (games, env))
+    if games is not None and (len(there) != len(here) or sum(there) > sum(here)):
         raise ValueError(
-            f"expected observations normalised as in the training of {name}, by {there} VecNormalize with statistics, "
-            f"got {here}; wrap the games alike, with training=False, and copy the statistics: "
-            "stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
+            f"expected observations normalised as in the training of {name}, by {len(there)} VecNormalize "
+            f"({sum(there)} with statistics), got {len(here)} ({sum(here)}); wrap the games alike, with training=False, "
+            "and copy the statistics: stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
         )
     agent = space.spaces.get(AGENT_KEY) if isinstance(space, spaces.Dict) else None
     names = getattr(agent, "names", None)
@@ -342,10 +343,10 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
         )
 
 
-def _n_normalized(env: VecEnv) -> int:
-    """Return the number of VecNormalize that normalise observations, and have seen any."""
+def _normalizers(env: VecEnv) -> list[bool]:
+    """Return, for each VecNormalize that normalises observations, whether it has statistics."""
     found = [layer.obs_rms for layer in layers(env) if isinstance(layer, VecNormalize) and layer.norm_obs]
-    return sum(min(one.count for one in (rms.values() if isinstance(rms, dict) else [rms])) >= 1 for rms in found)
+    return [min(one.count for one in (rms.values() if isinstance(rms, dict) else [rms])) >= 1 for rms in found]
 
 
 def evaluate_team(

@@ -176,9 +176,10 @@ def test_every_evaluation_has_the_statistics_of_training(tmp_path: Path) -> None
         ValueError, match="as many VecNormalize in the games of evaluation as in those of training, 1, got 0"
     ):
         ppo(normalised(0, True)).learn(ROLLOUT, plain)
-    for other in (plain.eval_env, normalised(1, False)):  # without, and without its statistics
-        with pytest.raises(ValueError, match=r"of the model, by 1 VecNormalize with statistics, got 0; .*sync"):
+    for other, got in ((plain.eval_env, 0), (normalised(1, False), 1)):  # without, and without its statistics
+        with pytest.raises(ValueError, match=rf"by 1 VecNormalize \(1 with statistics\), got {got} \(0\); .*sync"):
             sb3_saf.evaluate_team(ppo(games), other)
+    assert len(sb3_saf.evaluate_team(ppo(normalised(3, True)), evaluated, 2).returns) == 2  # a loaded one may have more
 
 
 class SometimesWon(CounterEnv):
