@@ -331,7 +331,7 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
     if games is not None and (len(there) != len(here) or sum(there) > sum(here)):
         raise ValueError(
             f"expected observations normalised as in the training of {name}, by {len(there)} VecNormalize "
-            f"({sum(there)} with statistics), got {len(here)} ({sum(here)}); wrap the games alike, with training=False, "
+            f"({sum(there)} with statistics), got {len(here)} ({sum(here)}); wrap the games alike, training=False, "
             "and copy the statistics: stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
         )
     agent = space.spaces.get(AGENT_KEY) if isinstance(space, spaces.Dict) else None
