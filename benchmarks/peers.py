@@ -107,7 +107,14 @@ PEERS: Final = (
         Peer(f"smax/{battle}", "JaxMARL's IPPO", "jaxmarl", battle, "ippo_rnn_smax", 10_000_000)
         for battle in ("2s3z", "3s_vs_5z")
     ),
-    Peer("vmas/balance n_agents:4", "BenchMARL's MAPPO", "benchmarl", "BALANCE", "Mappo", 100_000),
+    *(
+        Peer(f"vmas/{ours}", "BenchMARL's MAPPO", "benchmarl", theirs, "Mappo", 100_000)
+        for ours, theirs in (
+            ("balance n_agents:4", "BALANCE"),
+            ("navigation n_agents:3 shared_rew:False", "NAVIGATION"),
+            ("transport", "TRANSPORT"),
+        )
+    ),
     Peer(
         "lbf/Foraging-8x8-2p-3f-v3",
         "EPyMARL's MAPPO",

@@ -73,9 +73,14 @@ TASKS: Final = (
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000),
     Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000),
     Task("vmas/balance", 10_000_000),
-    *(
-        Task("vmas/balance", game_steps, params=("n_agents:4",), folder=f"vmas-balance-4-agents-{game_steps}")
-        for game_steps in (100_000, 1_000_000)  # BenchMARL's game
+    *(  # BenchMARL's games
+        Task(f"vmas/{scenario}", game_steps, params=params, folder=f"vmas-{scenario}-of-benchmarl-{game_steps}")
+        for scenario, params in (
+            ("balance", ("n_agents:4",)),
+            ("navigation", ("n_agents:3", "shared_rew:False")),
+            ("transport", ()),
+        )
+        for game_steps in (100_000, 1_000_000)
     ),
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
     Task("lbf/Foraging-15x15-4p-3f-v3", 5_000_000),

@@ -33,7 +33,7 @@ QUICK: Final[dict[str, dict[str, object]]] = {
     "1_worlds.ipynb": {"n_games": 8},
     "2_train_and_compare.ipynb": {"game_steps": 800, "seeds": [0, 1], "n_games": 8},
     "3_look_inside.ipynb": {"game_steps": 800, "n_games": 4},
-    "4_results_to_figures.ipynb": {"size": "smoke", "game_steps": 80, "seeds": [0, 1], "levels": "2"},
+    "4_results_to_figures.ipynb": {"size": "smoke", "game_steps": 80, "seeds": [0], "levels": "2", "episodes": 8},
     "5_your_own_environment.ipynb": {"game_steps": 800, "n_games": 8},
 }
 #: Seconds for one cell.

@@ -272,7 +272,8 @@ def test_a_cell_that_diverges_is_one_line_and_the_exit_code_is_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["run", "joint", "--size", "smoke", "--seeds", "0", "--levels", "2", "--methods", "ippo", "-n", "80"]
-    words += ["--retries", "0", "--workers", "1", "-f", str(tmp_path), "-params", "learning_rate:1.0e30"]
+    words += ["--episodes", "2", "--retries", "0", "--workers", "1"]
+    words += ["-f", str(tmp_path), "-params", "learning_rate:1.0e30"]
     assert cli.main(words) == 1
     printed = capsys.readouterr()
     assert "ippo TeamSupport c=2, h=2 seed 0: FAILED: " in printed.out

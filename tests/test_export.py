@@ -192,14 +192,14 @@ def test_an_actor_of_tile_codes_takes_pixels(exports: Callable[[str], Exported])
         actor.act(pictures)
 
 
-def test_the_critic_is_not_written(exports: Callable[[str], Exported], tmp_path: Path) -> None:
+def test_the_critic_is_not_written(exports: Callable[[str], Exported]) -> None:
     policy, folder, _ = exports("own encoder")
-    before = (folder / "actor.onnx").read_bytes()
-    with th.no_grad():
-        for parameter in policy.value_net.parameters():
-            parameter.add_(1.0)
-    assert (export_actors(policy, tmp_path) / "actor.onnx").read_bytes() == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["act.py", "actor.onnx"]
+    assert sorted(path.name for path in folder.iterdir()) == ["act.py", "actor.onnx"]
+    data = (folder / "actor.onnx").read_bytes()
+    for network, is_written in ((policy.actor, True), (policy.value_net, False)):
+        for layer in network.modules():
+            if isinstance(layer, nn.Linear):
+                assert (layer.weight.detach().numpy().tobytes() in data) == is_written
 
 
 # --- masks ------------------------------------------------------------------------------------------------------------
@@ -335,8 +335,8 @@ def test_wrong_memories(exports: Callable[[str], Exported]) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the pictures in the agents' observations are read as plain numbers")
-@pytest.mark.parametrize(("kind", "masks"), [("nested", "info"), ("pictures", "observation"), ("boxes", None)])
-def test_acts_on_what_the_game_gives(kind: str, masks: str | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "masks"), [("nested", "info"), ("pictures", "observation")])
+def test_acts_on_what_the_game_gives(kind: str, masks: str, tmp_path: Path) -> None:
     env = make_team_env(partial(Kinds, kind, masks), seed=0)
     heads = {"heads": "per_agent", "n_policies": 1}
     model: Any = PPO("SAFPolicy", env, seed=0, device="cpu", policy_kwargs=heads)

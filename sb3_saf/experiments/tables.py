@@ -49,7 +49,6 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from sb3_saf.experiments.definitions import MODULE, RANDOM, Cell, Experiment, Level, View, expand, merge
 from sb3_saf.experiments.results import BEST, BEST_MODEL, EVALUATIONS, LAST, MOST_LIKELY, Results
@@ -401,9 +400,11 @@ def mean_difference(differences: Sequence[float] | Floats, noise: float = 0.0, m
     if error == 0:
         p_equivalent = np.nan if np.isnan(margin) else float(abs(mean) >= margin)
         return Difference(Estimate(mean, mean, mean), float(mean == 0), p_equivalent, n)
-    half = float(stats.t.ppf(0.975, n - 1)) * error
-    p = 2 * float(stats.t.sf(abs(mean) / error, n - 1))
-    p_equivalent = float(stats.t.sf((margin - abs(mean)) / error, n - 1))
+    from scipy.special import stdtr, stdtrit  # imported here, since it takes a tenth of a second
+
+    half = float(stdtrit(n - 1, 0.975)) * error
+    p = 2 * float(stdtr(n - 1, -abs(mean) / error))
+    p_equivalent = float(stdtr(n - 1, (abs(mean) - margin) / error))
     return Difference(Estimate(mean, mean - half, mean + half), p, p_equivalent, n)
 
 
