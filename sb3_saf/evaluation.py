@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
 
+from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
@@ -266,15 +267,20 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
     remaining = (n_episodes + np.arange(n_games)) // n_games
     observations: Any = env.reset()
     starts = np.ones(env.num_envs, dtype=np.bool_)
-    while remaining.any():
-        actions = act(observations, starts)
-        following, rewards, row_dones, infos = env.step(actions)
-        dones = np.asarray(row_dones, dtype=np.bool_)
-        ended = team_dones(dones, n_agents, alone=True)
-        yield PlayedStep(observations, actions, following, rewards, dones, infos, ended, remaining > 0)
-        whole = [ended[game] and STAGGERED not in infos[game * n_agents] for game in range(n_games)]
-        remaining = np.maximum(remaining - whole, 0)
-        observations, starts = following, dones
+    try:
+        while remaining.any():
+            actions = act(observations, starts)
+            following, rewards, row_dones, infos = env.step(actions)
+            dones = np.asarray(row_dones, dtype=np.bool_)
+            ended = team_dones(dones, n_agents, alone=True)
+            yield PlayedStep(observations, actions, following, rewards, dones, infos, ended, remaining > 0)
+            whole = [ended[game] and STAGGERED not in infos[game * n_agents] for game in range(n_games)]
+            remaining = np.maximum(remaining - whole, 0)
+            observations, starts = following, dones
+    finally:  # whoever trains on these games holds observations of episodes that are gone
+        for layer in layers(env):
+            if isinstance(layer, CentralizedValueWrapper):
+                layer.was_evaluated = True
 
 
 def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False) -> Act:

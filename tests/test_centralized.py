@@ -9,6 +9,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
@@ -153,6 +154,25 @@ def test_a_time_limit_is_a_true_end_unless_told_otherwise() -> None:
     env.reset()
     env.step(still(env))
     assert env.step(still(env))[3][3]["TimeLimit.truncated"] is False
+
+
+def test_ends_that_do_not_tell_whether_they_are_time_limits_are_named_once() -> None:
+    class Silent(TeamVenv):
+        def step_wait(self) -> VecEnvStepReturn:
+            *rest, infos = super().step_wait()
+            for info in infos:
+                info.pop("TimeLimit.truncated", None)
+            return (*rest, infos)
+
+    for time_limit in ("terminal", "bootstrap"):
+        env = CentralizedValueWrapper(Silent(lengths=(2, 2)), time_limit=time_limit)  # type: ignore[arg-type]
+        env.reset()
+        env.step(still(env))
+        if time_limit == "bootstrap":
+            with pytest.warns(UserWarning, match="without 'TimeLimit.truncated'.* no value is added"):
+                env.step(still(env))
+        for _ in range(4):
+            env.step(still(env))
 
 
 def test_rows_say_where_episodes_begin_and_last_rows_which_row_they_are_of() -> None:

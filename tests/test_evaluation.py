@@ -362,6 +362,44 @@ class TestMasks:
         assert callback.best_mean_reward == 8
 
 
+class Lenient(MaskedGame):
+    """A game that accepts illegal actions."""
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        return Game.step(self, actions)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_who_does_not_read_masks_is_warned_once(space: str) -> None:
+    actions = SPACES[space]
+    env = make_team_env(
+        partial(Lenient, "info:action_mask", actions=actions, mask=partial(turning, actions)), 2, seed=0
+    )
+    env.reset()
+    first = np.zeros((4, *(actions.shape or ())), np.int64)
+    env.step(first)  # the first choices are legal in the first step only
+    with pytest.warns(UserWarning, match=r"agent 0 of game 0 took an action that its 'action_mask' forbids, \[?0"):
+        env.step(first)
+    env.step(first)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, QPLEX])
+def test_training_does_not_go_on_in_games_that_an_evaluation_has_played(algorithm: Any) -> None:
+    env = make_team_env(CounterEnv, 2, seed=0)
+    if algorithm is PPO:
+        model: Any = PPO("IPPOPolicy", env, **ppo_settings(env, n_steps=8, n_epochs=1), seed=0)
+    else:
+        model = QPLEX("QPLEXPolicy", env, seed=0, batch_size=8)
+    model.learn(8 * env.num_envs)
+    evaluate_team(RandomPolicy(env, seed=0), env, 2)
+    evaluate_team(model, env, 2)
+    with pytest.raises(RuntimeError, match=r"Give evaluations games of their own.*model.set_env\(model.get_env"):
+        model.learn(8 * env.num_envs, reset_num_timesteps=False)
+    model.set_env(model.get_env())
+    model.learn(8 * env.num_envs, reset_num_timesteps=False)
+    assert model.num_timesteps >= 16 * env.num_envs
+
+
 class TestTeamEvalCallback:
     def learn(
         self, callback: TeamEvalCallback, n_game_steps: int, folder: Path, n_games: int = 2, normalise: bool = False

@@ -33,6 +33,7 @@ from sb3_saf.teams.rows import (
     TeamSpaces,
     TerminalRow,
     allows_nothing,
+    are_allowed,
     channels_first,
     check_codes_are_kept,
     first_choices,
@@ -117,6 +118,10 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         self._n_steps = 0
         self._masks_shown: Array | None = None
         self._has_asked_for_masks = False
+        self._taken: Array | None = None
+        self._has_warned = {"masks": False, "limits": False}
+        #: Whether an evaluation has played these games since the last reset, see :func:`sb3_saf.evaluation.play`.
+        self.was_evaluated = False
 
     def _normalized(self, space: spaces.Space[Any], key: str) -> spaces.Space[Any]:
         """Return the space of a part of the rows behind VecNormalize, which keeps the space of what it normalises."""
@@ -165,11 +170,28 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """Continue from a state (see :meth:`checkpoint_state`)."""
         self._n_steps, self._masks_shown = state["n_steps"], state["masks_shown"]
         self._playing = state["playing"]
+        self.was_evaluated = False
 
     def reset(self) -> dict[str, Array]:
         """Start new episodes in all games and return the Dict observation of all rows."""
         self._playing = np.zeros_like(self._playing)
+        self.was_evaluated = False
         return self._joint_observation(self.venv.reset())
+
+    def step_async(self, actions: Array) -> None:
+        """
+        Start the step of all games.
+
+        :raises RuntimeError: if an evaluation has played the games, so that the actions belong to others
+        """
+        if self.was_evaluated:
+            raise RuntimeError(
+                "an evaluation has played these games: what their model saw last is of episodes that are gone. Give "
+                "evaluations games of their own, sb3_saf.make_team_env(...), or begin new episodes: "
+                "model.set_env(model.get_env()) before learn(..., reset_num_timesteps=False), else env.reset()"
+            )
+        self._taken = actions
+        super().step_async(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -184,6 +206,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             self._warn_of_unused_masks()
         obs, rewards, dones, infos = self.venv.step_wait()
         self._n_steps += 1
+        self._warn_of_unread_masks()
         check_finite("rewards", rewards, self.n_agents, self._n_steps)
         ended = team_dones(dones, self.n_agents)
         infos = self._complete_infos(infos, ended)
@@ -230,6 +253,22 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 "the games have action_masks(), which nobody has asked for: illegal actions may be taken. Train with "
                 'sb3_contrib.MaskablePPO("SAFPolicy", env), which asks (sb3_saf.train: -params algorithm:MaskablePPO), '
                 f"or give masks in infos[agent][{ACTION_MASK_KEY!r}], which every policy of sb3_saf reads",
+                UserWarning,
+                stacklevel=3,
+            )
+
+    def _warn_of_unread_masks(self) -> None:
+        """Warn once if agents that take part have taken actions that the masks in their rows forbid."""
+        if self._masks_shown is None or self._taken is None or self._has_warned["masks"]:
+            return
+        forbidden = ~are_allowed(self._taken, self._masks_shown, self.action_space) & (self._playing.reshape(-1) == 1)
+        if forbidden.any():
+            self._has_warned["masks"] = True
+            row = int(np.flatnonzero(forbidden)[0])
+            warnings.warn(
+                f"agent {row % self.n_agents} of game {row // self.n_agents} took an action that its "
+                f"{ACTION_MASK_KEY!r} forbids, {self._taken[row]}: Stable-Baselines3's own policies do not read masks. "
+                'Those of sb3_saf do, as in PPO("SAFPolicy", env)',
                 UserWarning,
                 stacklevel=3,
             )
@@ -308,6 +347,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         if not ended.any():
             return infos
         rows = np.flatnonzero(ended.repeat(self.n_agents))
+        self._warn_of_missing_limits(infos, rows)
         last = self._terminal_parts([infos[row] for row in rows.tolist()], np.flatnonzero(ended).tolist())
         of_games = last.keys() & {TEAM_KEY, ACTIVE_KEY}
         by_row = [
@@ -321,6 +361,18 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 info[TRUNCATED] = False
             infos[row] = info
         return infos
+
+    def _warn_of_missing_limits(self, infos: list[dict[str, Any]], rows: npt.NDArray[np.int64]) -> None:
+        """Warn once if time limits are to be bootstrapped and ends do not tell whether they are one."""
+        if self.time_limit == "terminal" or self._has_warned["limits"] or any(TRUNCATED in infos[row] for row in rows):
+            return
+        self._has_warned["limits"] = True
+        warnings.warn(
+            f"time_limit='bootstrap' without {TRUNCATED!r} in the infos of an ended episode: no value is added, as if "
+            "it had terminated. Let the environment set it as SB3's VecEnvs do, or use sb3_saf.make_team_env",
+            UserWarning,
+            stacklevel=4,
+        )
 
     def _terminal_parts(self, infos: list[dict[str, Any]], games: list[int]) -> dict[str, Array]:
         """Return the parts of the last observations of ended games: (G * N, ...), or (G, ...) if they are of a game."""

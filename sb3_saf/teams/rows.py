@@ -305,6 +305,13 @@ def allows_nothing(masks: Array, action_space: spaces.Space[Any]) -> npt.NDArray
     return np.asarray((np.add.reduceat(masks != 0, starts, axis=1, dtype=np.int64) == 0).any(axis=1))
 
 
+def are_allowed(actions: Array, masks: Array, action_space: spaces.Space[Any]) -> npt.NDArray[np.bool_]:
+    """Return which actions (B, ...) are legal by their masks (B, A), (B,)."""
+    starts = np.flatnonzero(first_choices(action_space)) - getattr(action_space, "start", 0)
+    entries = starts + np.asarray(actions, dtype=np.int64).reshape(len(masks), -1)
+    return np.asarray(np.take_along_axis(masks, entries, axis=1).all(axis=1))
+
+
 def fill_idle_rows(rows: Array, active: Array) -> None:
     """
     Fill the own observations of agents that take no part with copies of those of their team that do.
