@@ -162,10 +162,10 @@ def test_ends_that_do_not_tell_whether_they_are_time_limits_are_named_once() -> 
             *rest, infos = super().step_wait()
             for info in infos:
                 info.pop("TimeLimit.truncated", None)
-            return (*rest, infos)
+            return (*rest, infos)  # type: ignore[return-value]
 
     for time_limit in ("terminal", "bootstrap"):
-        env = CentralizedValueWrapper(Silent(lengths=(2, 2)), time_limit=time_limit)  # type: ignore[arg-type]
+        env = CentralizedValueWrapper(Silent(lengths=(2, 2)), time_limit=time_limit)
         env.reset()
         env.step(still(env))
         if time_limit == "bootstrap":
