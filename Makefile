@@ -10,8 +10,9 @@ JOBS ?= 2
 
 VENV = .venv
 RUN = $(VENV)/bin/python -m
-# Without setuptools' box on editable installations, which looks like an error.
-INSTALL = $(VENV)/bin/python -W ignore::UserWarning -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Without setuptools' box on editable installations, which looks like an error. Modules are compiled when first imported:
+# compiling all of torch's takes longer than the rest.
+INSTALL = $(VENV)/bin/python -W ignore::UserWarning -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 # What training needs, and everything: linters, Sphinx, Ray, notebooks, ...
 TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed

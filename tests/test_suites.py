@@ -140,7 +140,7 @@ def test_the_table_of_results_is_that_of_the_raw_data(tmp_path: Path) -> None:
     assert fill(page, {"table": "\n".join(lines)}) == page
     assert len({line.count("|") for line in lines if line.startswith("|")}) == 1
     *_, missing = table(TASKS, tmp_path)
-    assert all(f"`{task.env_id}` (" in missing for task in TASKS)
+    assert all(f"`{task.game}` (" in missing for task in TASKS)
     assert {task.env_id.partition("/")[0] for task in TASKS} <= set(suites())
     assert "`mpe/simple_spread_v3` (-59.5 (1))" in missing
     assert "| **-62.65** | -59.5 (1) |" in page and "1. XuanCe's MAPPO (continuous actions) after 1,000,000" in page
