@@ -372,7 +372,8 @@ def evaluate_team(
         action_masks=...)`` of models that take them, such as those of MaskablePPO. Teams of another size than the
         trained one can be played unless the actor depends on the agent's index (``heads="per_agent"``,
         ``actor_identity``, QPLEX with memory)
-    :param env: vector environment of teams, for instance from ``make_team_env``
+    :param env: vector environment of teams, for instance from ``make_team_env``. Training cannot go on in these games
+        before they are reset, since what its model saw last would be of other episodes
     :param n_eval_episodes: team episodes to play
     :param deterministic: whether the model takes its most likely actions
     :param render: whether to render after each step
