@@ -10,13 +10,16 @@ JOBS ?= 2
 
 VENV = .venv
 RUN = $(VENV)/bin/python -m
-# Without setuptools' box on editable installations, which looks like an error. Modules are compiled when first imported:
-# compiling all of torch's takes longer than the rest.
+# Without setuptools' box on editable installations, which looks like an error.
 INSTALL = $(VENV)/bin/python -W ignore::UserWarning -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 # What training needs, and everything: linters, Sphinx, Ray, notebooks, ...
 TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
 GRIDWORLDS = $(VENV)/.gridworlds
+
+# Many processes are started: they keep compiled modules, whatever the environment says, and pip leaves compiling to them,
+# since all of torch takes longer than the rest of the installation.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: help install train test coverage bench docs notebooks teams check format-check lint types format clean distclean
 
