@@ -381,7 +381,7 @@ def evaluate_team(
         ``info`` agent 0's, ``reward`` the team's, ``done`` whether the episode ended
     :param warn: warn if there is no TeamMonitor, so that returns are those of the outermost wrapper
     :return: team returns and lengths in game steps, in the order in which the episodes ended
-    :raises ValueError: if ``env`` has no teams, or the model was trained on another game
+    :raises ValueError: if ``env`` has no teams or a VecMonitor around them, or the model was trained on another game
     """
     check_count("n_eval_episodes", n_eval_episodes)
     n_agents = _team_size(env)
@@ -413,9 +413,14 @@ def evaluate_team(
             episode = {"r": returns_now[i].sum(), "l": lengths_now[i], "agents": returns_now[i].tolist()}
             if monitored:
                 episode = info["episode"]
+            if n_agents > 1 and "agents" not in episode:
+                raise ValueError(
+                    "expected episodes of TeamMonitor in infos, got those of a VecMonitor around it, which counts each "
+                    "agent for a game: leave it away, TeamMonitor counts episodes and writes monitor.csv as it does"
+                )
             returns.append(float(episode["r"]))
             lengths.append(int(episode["l"]))
-            agent_returns.append(tuple(episode["agents"]))
+            agent_returns.append(tuple(episode.get("agents", (episode["r"],))))
             if (won := episode_value(infos, IS_SUCCESS)) is not None:
                 successes.append(won)
         returns_now[step.ended], lengths_now[step.ended] = 0, 0

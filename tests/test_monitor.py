@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from sb3_saf.callbacks import GameStepsCallback, game_steps
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.evaluation import RandomPolicy
+from sb3_saf.evaluation import RandomPolicy, evaluate_team
 from tests.team_venv import TeamVenv, still
 
 #: Team return of an episode of n steps of game e: agents 0, 1, 2 get 100 e + 10 i + step.
@@ -187,7 +187,12 @@ def test_sb3s_own_monitor_around_teams_or_below_is_warned_of() -> None:
     assert len(told) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        VecMonitor(CentralizedValueWrapper(TeamVenv(lengths=(2, 2), n_agents=1)))  # a single agent is an environment
+        alone = VecMonitor(CentralizedValueWrapper(TeamMonitor(TeamVenv(lengths=(2, 2), n_agents=1))))
+    assert evaluate_team(RandomPolicy(alone.action_space, 0), alone, 2).agent_returns == ((3,), (203,))
+    with pytest.warns(UserWarning, match=OURS):
+        team = VecMonitor(TeamMonitor(TeamVenv(lengths=(2, 2))))
+    with pytest.raises(ValueError, match="those of a VecMonitor around it"):
+        evaluate_team(RandomPolicy(team.action_space, 0), team, 2)
 
 
 def logged(model: BaseAlgorithm, folder: Path, n_steps: int) -> list[dict[str, str]]:
