@@ -232,6 +232,16 @@ def test_the_kitchen() -> None:
     assert dones.all() and infos[0]["TimeLimit.truncated"] is True
     with pytest.raises(ValueError, match="MPE_simple_spread_v3 has no rewards for steps on the way"):
         rows_of("jaxmarl/MPE_simple_spread_v3", 1, reward_shaping=1.0)
+    plain = rows_of("overcooked/cramped_room", 1)
+    assert plain.settings() != rows_of("overcooked/cramped_room", 1, **shaped).settings()
+
+
+@needs_jaxmarl
+def test_parameters_that_particles_do_not_know_are_named() -> None:
+    with pytest.raises(ValueError, match=r"has no parameters \['max_cycles', 'n_agents'\]; its number of agents is"):
+        rows_of("jaxmarl/MPE_simple_spread_v3", 1, n_agents=5, max_cycles=50)
+    known = {"num_agents": 4, "num_landmarks": 4, "max_steps": 2, "action_type": "Discrete", "damping": 0.5}
+    assert rows_of("jaxmarl/MPE_simple_spread_v3", 1, **known).num_envs == 4
 
 
 @needs_jaxmarl

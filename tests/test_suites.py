@@ -268,9 +268,10 @@ def test_wrapped_games_keep_the_settings_of_their_suite() -> None:
 
 @needs("lbf")
 def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
-    env: Any = find_environment("lbf/Foraging-8x8-2p-3f-v3").make_game({})
+    env: Any = find_environment("lbf/Foraging-8x8-2p-3f-v3").make_game({"max_episode_steps": 60})
     env.reset(seed=0)
-    for _ in range(50):
+    for _ in range(60):
+        assert env.agents, "the game's 50 steps are no limit if others are given"
         *_, terminations, truncations, infos = env.step(dict.fromkeys(env.possible_agents, 0))
     assert set(terminations.values()) == {False} and set(truncations.values()) == {True} and not env.agents
     assert infos["agent_0"]["is_success"] is False

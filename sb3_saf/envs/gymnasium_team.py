@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, Final
 
 import gymnasium as gym
@@ -164,7 +165,11 @@ def as_parallel(env: Any) -> Any:
 
 def make_gymnasium(env_id: str, render_mode: str | None, params: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """Make an environment of Gymnasium's registry without the checks and wrappers for a single agent."""
-    return gym.make(env_id, render_mode=render_mode, disable_env_checker=True, **params)
+    spec = deepcopy(gym.spec(env_id))
+    # A parameter of both the game and of `make`, such as `max_episode_steps`, is the game's.
+    spec.kwargs.update({name: value for name, value in params.items() if name in spec.kwargs})
+    others = {name: value for name, value in params.items() if name not in spec.kwargs}
+    return gym.make(spec, render_mode=render_mode, disable_env_checker=True, **others)
 
 
 def _first_action(space: spaces.Space[Any]) -> Any:

@@ -15,7 +15,7 @@ from sb3_saf.suites.registry import Suite
 
 #: Time limits in game steps that BenchMARL's tasks have; of all others 100.
 _LIMITS: Final = {
-    **dict.fromkeys(("ball_passage", "buzz_wire", "football", "joint_passage", "joint_passage_size", "passage"), 500),
+    **dict.fromkeys(("ball_passage", "football", "joint_passage", "joint_passage_size", "passage"), 500),
     "multi_give_way": 200,
 }
 

@@ -140,7 +140,8 @@ class BatchVecEnv(TeamVecEnv):
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
     :param render_mode: None or ``"rgb_array"``; games with objects of their own take all that these know
     :param stagger: whether episodes begun by :meth:`reset` end at different times: that of game ``e`` is shorter by
-        ``e / E`` of its length, and its last infos have ``"staggered"``
+        ``e / E`` of its length, and its last infos have ``"staggered"``. The first observation of a game that shows the
+        time that is left is still that of a whole episode
     :raises ValueError: for any other render mode
     """
 

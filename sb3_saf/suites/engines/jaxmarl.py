@@ -8,6 +8,7 @@ suite's ``reset`` after ``step_env``: its ``step`` also resets, but loses the la
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,7 @@ from sb3_saf.suites.engines.jaxmarl_package import spaces as jax_spaces
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 _ALL: Final = "__all__"
+_PARTICLES: Final = "MPE_"
 _WORLD_STATE: Final = "world_state"
 
 
@@ -303,6 +305,8 @@ class JaxGames(ResumableBatch):
             shares_reward=programs.rules.shares_reward and not extra_weight,
         )
         self._programs = programs
+        if extra_weight:
+            self.settings |= {"reward_shaping": extra_weight, "reward_shaping_steps": extra_steps}
         self._extra_weight = extra_weight
         self._extra_steps = extra_steps
         self._n_steps = 0
@@ -462,7 +466,7 @@ _RULES: Final[dict[str, Rules]] = {
 
 def rules_of(name: str) -> Rules:
     """Return the rules of an environment."""
-    if name.startswith("MPE_"):
+    if name.startswith(_PARTICLES):
         return Rules(draw=_draw_particles)
     return _RULES.get(name, Rules())
 
@@ -504,6 +508,12 @@ def _programs(name: str, params: _Params, with_state: bool) -> JaxPrograms:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # Overcooked recommends its second version
         env = jaxmarl.make(name, **params.params)
+    if name.startswith(_PARTICLES):  # which ignore parameters that they do not know
+        known = {one for base in type(env).__mro__ for one in inspect.signature(base).parameters} | set(vars(env))
+        if unknown := sorted(params.params.keys() - known):
+            raise ValueError(
+                f"{name} has no parameters {unknown}; its number of agents is num_agents, its time limit max_steps"
+            )
     return JaxPrograms(env, rules_of(name), with_state)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import io
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, Final
 
 import numpy as np
@@ -64,7 +65,7 @@ class VmasGames(Batch):
 
     def reset(self, seeds: Sequence[int] | None) -> dict[str, Array]:
         """Begin an episode in every game; the first seed is used for the batch (see the base class)."""
-        with self._own_randomness():
+        with self._own_randomness(), _gpus_left_alone(self.env.device):
             observations = self.env.reset(seed=None if seeds is None else seeds[0] % 2**32)
         return self._rows(observations, np.ones(self.n_games, dtype=bool))
 
@@ -115,6 +116,11 @@ class VmasGames(Batch):
         """Return VMAS's picture of a game; needs a display, or EGL (see the base class)."""
         with self._own_randomness():
             return np.asarray(self.env.render(mode="rgb_array", env_index=game), dtype=np.uint8)
+
+
+def _gpus_left_alone(device: str | th.device) -> AbstractContextManager[None]:
+    """Keep the random states of GPUs: VMAS seeds them, too, and only games on a GPU draw from them."""
+    return th.random.fork_rng(range(th.cuda.device_count()) if th.device(device).type == "cpu" else ())
 
 
 def _observe(env: Any) -> list[Any]:
@@ -173,7 +179,7 @@ def vec_env(
     """
     if state:
         raise ValueError(f"vmas/{scenario} tells no state of the game; leave state=True out")
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as said, _gpus_left_alone(device):
         warnings.simplefilter("always")
         env = vmas.make_env(
             scenario,
