@@ -22,7 +22,7 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array
+from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array, NormalizedSpace
 from sb3_saf.teams.vec_env import episode_value, find_n_agents, layers, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
@@ -339,6 +339,12 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
             f"expected observations normalised as in the training of {name}, by {len(there)} VecNormalize "
             f"({sum(there)} with statistics), got {len(here)} ({sum(here)}); wrap the games alike, training=False, "
             "and copy the statistics: stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
+        )
+    is_normalized, were_normalized = (isinstance(one, NormalizedSpace) for one in (own, trained.own))
+    if is_normalized != were_normalized and own != trained.own:  # the model comes without its games
+        raise ValueError(
+            f"expected observations {'' if were_normalized else 'not '}normalised by VecNormalize, as in the training "
+            f"of {name}, got {own}; wrap the games alike, training=False, with the statistics of the training"
         )
     agent = space.spaces.get(AGENT_KEY) if isinstance(space, spaces.Dict) else None
     names = getattr(agent, "names", None)

@@ -240,7 +240,13 @@ def test_the_kitchen() -> None:
 def test_parameters_that_particles_do_not_know_are_named() -> None:
     with pytest.raises(ValueError, match=r"has no parameters \['max_cycles', 'n_agents'\]; its number of agents is"):
         rows_of("jaxmarl/MPE_simple_spread_v3", 1, n_agents=5, max_cycles=50)
-    known = {"num_agents": 4, "num_landmarks": 4, "max_steps": 2, "action_type": "Discrete", "damping": 0.5}
+    known: dict[str, Any] = {
+        "num_agents": 4,
+        "num_landmarks": 4,
+        "max_steps": 2,
+        "action_type": "Discrete",
+        "damping": 0.5,
+    }
     assert rows_of("jaxmarl/MPE_simple_spread_v3", 1, **known).num_envs == 4
 
 

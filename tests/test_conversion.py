@@ -178,6 +178,13 @@ def test_masks_are_passed_by_agent() -> None:
         masks = dict.fromkeys(observations, np.eye(3)[action])
         assert model.predict(observations, action_masks=masks)[0] == dict.fromkeys(observations, action)
         assert model.predict(observations["b"], action_masks=masks["b"])[0] == action
+    for _ in range(5):  # whoever has no mask may do everything
+        partly = {**dict.fromkeys(observations), "b": np.eye(3)[2]}
+        assert model.predict(observations, action_masks=partly, deterministic=False)[0]["b"] == 2
+        infos: Any = {agent: {} if mask is None else {"action_mask": mask} for agent, mask in partly.items()}
+        assert model.predict((observations, infos), deterministic=False)[0]["b"] == 2
+    with pytest.raises(ValueError, match=r"expected a mask of each observed agent, .* got none of \['agent', 'c'"):
+        model.predict(observations, action_masks={"b": np.eye(3)[2]})
 
 
 @pytest.mark.parametrize(

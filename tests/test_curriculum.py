@@ -74,6 +74,15 @@ def test_an_agent_that_dies_as_its_stage_ends_is_not_cut() -> None:
     assert [info["TimeLimit.truncated"] for info in infos] == [True, False]
 
 
+def test_an_agent_that_a_limit_stops_as_its_stage_ends_keeps_its_last_observation() -> None:
+    env = make_team_env(CounterEnv(max_cycles=9, cuts={1: 4}), time_limit="bootstrap", curriculum=[Stage(4, {})])
+    env.reset()
+    for _ in range(4):
+        *_, infos = env.step(np.zeros(2, np.int64))
+    last = infos[1]["terminal_observation"]
+    assert last["obs"][:2].tolist() == [4, 1] and last["active"].tolist() == [1, 1]
+
+
 def test_new_seeds_begin_with_the_first_stage() -> None:
     """A model that is made on used games trains on all stages."""
     env = _staged()

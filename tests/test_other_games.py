@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -31,6 +32,7 @@ from sb3_saf import (
     TurnsInParallel,
     check_team_env,
     evaluate_team,
+    inspect_team,
     make_team_env,
 )
 from sb3_saf.training.wrappers import wrap_game, wrap_rows
@@ -428,6 +430,20 @@ def test_statistics_of_observations_leave_out_the_dead() -> None:
         assert (obs["obs"][obs["active"][:, 0] == 0][::2] == 0).all(), "policies see zeros"
     assert normal.obs_rms["obs"].mean == pytest.approx(10, abs=0.2)
     assert normal.obs_rms["obs"].var == pytest.approx(1, abs=0.2)
+
+
+def test_a_model_without_its_games_tells_that_they_were_normalised(tmp_path: Path) -> None:
+    plain = make_team_env(Alone, 2)
+    normal = CentralizedValueWrapper(VecNormalize(plain.venv, norm_obs_keys=["obs"], norm_reward=False, training=False))
+    model = ppo(normal)
+    model.save(tmp_path / "model")
+    loaded = PPO.load(tmp_path / "model")
+    assert len(evaluate_team(loaded, normal, 2).returns) == 2
+    for play in (lambda: evaluate_team(loaded, plain, 2), lambda: inspect_team(model, plain, 2)):
+        with pytest.raises(ValueError, match="expected observations normalised by VecNormalize, as in the training of"):
+            play()
+    with pytest.raises(ValueError, match="expected observations not normalised by VecNormalize"):
+        evaluate_team(ppo(plain).policy, normal, 2)
 
 
 class Showing(Game):

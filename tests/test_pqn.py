@@ -91,11 +91,15 @@ def test_it_learns_team_support() -> None:
     assert evaluate_team(model, tests, 64).mean > 3.5
 
 
-class StopAtSecondStep(BaseCallback):
-    """Ends the training."""
+class StopAfterStep(BaseCallback):
+    """Ends the training after ``n_steps`` steps."""
+
+    def __init__(self, n_steps: int) -> None:
+        super().__init__()
+        self.n_steps = n_steps
 
     def _on_step(self) -> bool:
-        return self.n_calls < 2
+        return self.n_calls < self.n_steps
 
 
 def test_each_rollout_is_learned_from_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +108,7 @@ def test_each_rollout_is_learned_from_once(monkeypatch: pytest.MonkeyPatch) -> N
     assert model._n_updates == 3 * 2 * 2
     assert model._buffer().size() == 0
     before = weights_of(model)
-    model.learn(4 * 4 * 3, StopAtSecondStep())
+    model.learn(4 * 4 * 3, StopAfterStep(2))
     assert weights_of(model) == before
     assert model._buffer().size() == 2  # the last step is stored, too
     ends: list[th.Tensor] = []
@@ -117,6 +121,10 @@ def test_each_rollout_is_learned_from_once(monkeypatch: pytest.MonkeyPatch) -> N
     model.learn(1)  # to the end of a rollout; games begin anew
     assert weights_of(model) != before and model.num_timesteps == 4 * 4 * 3
     assert ends[0].tolist() == [[False] * 4, [True] * 4, [False] * 4, [False] * 4]
+    model = make_model(rollout_steps=4, batch_size=8)
+    model.learn(4 * 4 * 3, StopAfterStep(4))  # a whole rollout is stored, and its first step makes room for another
+    model.learn(1)
+    assert ends[-1].tolist() == [[False] * 4, [False] * 4, [True] * 4, [False] * 4]
 
 
 def test_a_batch_is_at_most_the_rollout() -> None:

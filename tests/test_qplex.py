@@ -268,6 +268,13 @@ def test_updates_do_not_depend_on_the_number_of_games(n_games: int) -> None:
     model = make_model(toy_env(n_games), train_freq=8, learning_starts=0)
     model.learn(96 * 3)
     assert model._n_updates == 12
+    model = make_model(toy_env(n_games), learning_starts=1000, target_update_interval=8, tau=0.1)
+    online, targets = model.policy.parameter_pairs()
+    for parameters, value in ((online, 1.0), (targets, 0.0)):
+        for parameter in parameters:
+            parameter.data.fill_(value)
+    model.learn(48 * 3)
+    assert targets[0].flatten()[0].item() == pytest.approx(1 - 0.9**6)
 
 
 def test_logs_tell_what_is_learned(tmp_path: Path) -> None:

@@ -239,6 +239,8 @@ def test_means_are_of_the_agents_that_are_in_the_game(browser: Any, tmp_path: Pa
     browser.find_element("tag name", "body").send_keys("\ue014")
     assert recording.values[1, 0] != recording.values[1, 1]
     assert f"Mean value {recording.values[1, 0]:.2f}," in browser.find_element("id", "team-value").text
+    browser.find_element("tag name", "body").send_keys("\ue014\ue014")
+    assert browser.find_element("id", "clock").text == "step 3 of 3", "the last reward is shown, with the last picture"
 
 
 def test_returns_have_the_scale_of_values_that_were_learned_with_normalize(tmp_path: Path) -> None:

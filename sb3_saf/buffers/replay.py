@@ -340,7 +340,7 @@ class TeamReplayBuffer(ReplayBuffer):
         # Steps before the oldest are replaced by it, with a reset of the memory at each, so they have no effect.
         steps, games = np.maximum(raw, 0), np.repeat(games, len(window))
         samples = self._get_samples(steps * self.n_games + games)
-        slots = self._slots(steps)
+        slots = self.slots(steps)
         starts = self.starts[slots, games]
         last = self.actions[(slots - 1) % self.n_slots, games].astype(np.int64)
         last[starts] = _NO_ACTION
@@ -367,7 +367,7 @@ class TeamReplayBuffer(ReplayBuffer):
         steps = np.random.randint(0, n_steps, size=count)  # noqa: NPY002
         return steps, np.random.randint(0, self.n_games, size=count)  # noqa: NPY002
 
-    def _slots(self, steps: Indices) -> Indices:
+    def slots(self, steps: Indices) -> Indices:
         """Return the slots of steps that are counted from the oldest."""
         return (self.pos - self.size() + steps) % self.n_slots
 
@@ -383,7 +383,7 @@ class TeamReplayBuffer(ReplayBuffer):
         if env is not None:
             raise ValueError("TeamReplayBuffer does not undo VecNormalize; scale observations in the game")
         steps, games = np.divmod(batch_inds, self.n_games)
-        slots = self._slots(steps)
+        slots = self.slots(steps)
         now = {key: array[slots, games] for key, array in self.seen.items()}
         after = {key: array[(slots + 1) % self.n_slots, games] for key, array in self.seen.items()}
         places = self.aside_index[slots, games]

@@ -89,7 +89,8 @@ class Curriculum(TeamVecEnvWrapper):
                     {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
                 )
                 is_cut = info.get(TRUNCATED, bool(info.get("active", True)))
-                info = {**info, TERMINAL_OBSERVATION: last, TRUNCATED: is_cut, STAGGERED: True}
+                # An agent that its own time limit stopped in this step has a last observation.
+                info = {TERMINAL_OBSERVATION: last, **info, TRUNCATED: is_cut, STAGGERED: True}
             shown.append(info)
         self._enter(self._present_stage())
         return self.venv.reset(), rewards, np.ones_like(dones), shown

@@ -30,6 +30,7 @@ from sb3_saf.teams.rows import (
     TERMINAL_OBSERVATION,
     TRUNCATED,
     Array,
+    NormalizedSpace,
     TeamSpaces,
     TerminalRow,
     allows_nothing,
@@ -134,7 +135,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"expected VecNormalize over vectors, got it over the pictures of {space} in {key!r}, which encoders "
                 "scale: pass VecNormalize(..., norm_obs=False), or name other norm_obs_keys"
             )
-        return spaces.Box(-layer.clip_obs, layer.clip_obs, space.shape, np.float32)
+        return NormalizedSpace(-layer.clip_obs, layer.clip_obs, space.shape, np.float32)
 
     def has_attr(self, attr_name: str) -> bool:
         """Return whether games have an attribute; ``action_masks`` also where observations have ``action_mask``."""

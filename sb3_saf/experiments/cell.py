@@ -118,14 +118,16 @@ def _train(job: Job, folder: Path) -> BaseAlgorithm:
     if (folder / FINISHED).exists():
         model = _load(job)
     else:
+        begun = None
         try:
-            CheckpointFolder(folder / CHECKPOINTS).newest()
+            begun = CheckpointFolder(folder / CHECKPOINTS).newest()
         except CheckpointError as error:  # this version cannot read any of them
             print(f"Beginning anew: {error}")
             shutil.rmtree(folder / CHECKPOINTS)
-        words = ["python", "-m", "sb3_saf.train", "--algo", find_method(cell.method).algo, "--env", cell.env]
-        command = shlex.join([*words, *job.config.words(cell), "--seed", str(cell.seed)])
-        write_run(folder, **job.config.describe(cell), command=command)
+        if begun is None:  # else the versions are those of the run's beginning
+            words = ["python", "-m", "sb3_saf.train", "--algo", find_method(cell.method).algo, "--env", cell.env]
+            command = shlex.join([*words, *job.config.words(cell), "--seed", str(cell.seed)])
+            write_run(folder, **job.config.describe(cell), command=command)
         options = RunOptions(
             eval_freq=job.config.eval_freq,
             eval_episodes=job.config.eval_episodes,

@@ -45,6 +45,7 @@ from sb3_saf.qplex.policies import AgentMemory, QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.checks import ExportError
 from sb3_saf.teams.files import atomic_file, write_text
+from sb3_saf.teams.rows import NormalizedSpace
 
 #: Policies whose actors read only one agent's own observation, index, mask and memory.
 ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy
@@ -88,8 +89,7 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
             "export_actors needs onnx, onnxscript and onnxruntime: pip install 'sb3-saf[export]'"
         ) from error
     policy = _checked_policy(model)
-    layer = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
-    if layer is not None and layer.norm_obs:
+    if isinstance(policy.team_spaces.own, NormalizedSpace):
         warnings.warn(
             "the model was trained on observations normalised by VecNormalize, whose statistics are not exported; "
             "normalise what the actors observe, as env.normalize_obs does",

@@ -79,7 +79,7 @@ function drawStage(run, element) {
 }
 
 function drawFrame(run, element) {
-  const image = run.images[clamp(state.t, run)];
+  const image = run.images[row(state.t, run)];
   if (!image.naturalWidth) return;
   const { context: c, width, height } = canvasOf(element, (x) => (x * image.naturalHeight) / image.naturalWidth);
   c.imageSmoothingEnabled = false;
@@ -168,7 +168,7 @@ function drawView(run) {
   const picture = c.createImageData(width * tile, height * tile);
   for (const y of range(height * tile)) {
     for (const x of range(width * tile)) {
-      const code = run.views.at(clamp(state.t, run), state.agent, Math.floor(y / tile), Math.floor(x / tile));
+      const code = run.views.at(row(state.t, run), state.agent, Math.floor(y / tile), Math.floor(x / tile));
       const place = 4 * (y * width * tile + x);
       for (const channel of range(3)) picture.data[place + channel] = tiles.at(code, y % tile, x % tile, channel);
       picture.data[place + 3] = 255;

@@ -188,8 +188,9 @@ class PQN(QPLEX):
         with th.no_grad():
             every = th.arange(len(rollout.rewards), device=self.device).split(batch_size)
             following = th.cat([joint_values(self.policy, _select(rollout.after, rows)) for rows in every])
-        ended = buffer.ended[: self.rollout_steps].copy()
-        ended[:-1] |= buffer.starts[1 : self.rollout_steps]  # also where learn was called again
+        slots = buffer.slots(np.arange(self.rollout_steps))
+        ended = buffer.ended[slots]
+        ended[:-1] |= buffer.starts[slots[1:]]  # also where learn was called again
         rewards, following, dones = (part.view(shape) for part in (rollout.rewards, following, rollout.dones))
         cuts = th.as_tensor(ended, device=self.device)
         returns = lambda_returns(rewards, following, dones, cuts, self.gamma, self.td_lambda).flatten()

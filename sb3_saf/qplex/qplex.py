@@ -370,7 +370,7 @@ class QPLEX(OffPolicyAlgorithm):
 
     def _on_step(self) -> None:
         """Update the target networks and the exploration rate."""
-        if self._crossed(self.target_update_interval):
+        for _ in range(self._crossed(self.target_update_interval)):
             polyak_update(*self.policy.parameter_pairs(), self.tau)
         self._update_exploration_rate()
         self.logger.record("rollout/replay_buffer_size", self._buffer().n_stored)

@@ -466,6 +466,10 @@ def given_by_game(
     if agents is not None:
         masks = [mask_in(infos.get(name)) for name in agents]
         if isinstance(action_masks, Mapping):
+            if missing := [name for name in agents if name not in action_masks]:
+                raise ValueError(
+                    f"expected a mask of each observed agent, None for all of its actions, got none of {missing}"
+                )
             masks = [action_masks[name] for name in agents]
         indices = list(range(len(agents))) if names is None else [names.index(name) for name in agents]
         known = indices if names is not None or len(agents) == team.n_agents else None
@@ -542,8 +546,13 @@ def _given(
     if len(shapes := {array.shape for array in own}) > 1:
         raise ValueError(f"expected observations of one shape, that of rows, {team.own_shape}, got {sorted(shapes)}")
     rows = {OBS: np.stack(own)} | ({} if indices is None else {AGENT: np.array(indices)})
-    has_masks = takes_masks and all(mask is not None for mask in legal)
-    action_masks = np.stack([np.asarray(mask) for mask in legal]) if has_masks else None
+    given = [np.asarray(mask) for mask in legal if mask is not None]
+    action_masks = None
+    if takes_masks and given:  # an agent without a mask has all of its actions
+        whole = [np.ones_like(given[0])] * len(own) if conversions is None else [one.mask(None) for one in conversions]
+        action_masks = np.stack(
+            [other if mask is None else np.asarray(mask) for mask, other in zip(legal, whole, strict=True)]
+        )
     if action_masks is not None and team.has_masks:
         rows, action_masks = {**rows, ACTION_MASK: action_masks}, None
     return Given(rows, action_masks, conversions, agents)

@@ -82,6 +82,10 @@ class AgentSpace(spaces.Discrete):
         return super().__repr__() if self.names is None else f"Discrete({self.n}, names={self.names})"
 
 
+class NormalizedSpace(spaces.Box):
+    """Box of what VecNormalize gives; saved with a model, it tells that others must normalise as well."""
+
+
 class TerminalRow(dict[str, Any]):
     """
     Last observation of a row, ``infos[row]["terminal_observation"]``.
