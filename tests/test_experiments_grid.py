@@ -237,6 +237,8 @@ BAD = {
     ("report", "joint", "-f", "empty"): "empty has no results of 'joint'; run it first: ",
     ("run", "joint", "--size", "huge"): "argument --size: invalid choice",
     ("run", "joint", "-params", "policy_kwargs:{n_slots: 4}"): "unknown argument of MAPPOPolicy 'n_slots'",
+    ("run", "joint", "-params", "env_kwargs:{coordination: 2}"): "coordination is what the experiment varies; leave it",
+    ("run", "joint", "--methods", "saf-paper", "-params", "policy_kwargs:{n_slots: 6}"): "saf-paper sets policy_kwargs",
     ("fly",): "argument COMMAND: invalid choice",
     ("check",): "the following arguments are required: FOLDER/CELL",
     ("check", "empty"): "expected RESULTS/cells/TASK-LEVEL/METHOD/seed-N",

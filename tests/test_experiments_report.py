@@ -122,6 +122,10 @@ def test_results_as_tables(folder: Path) -> None:
     last = curves.groupby(["method", "task", "level", "coordination", "seed"])["game_steps"].max()
     assert len(last) == 2 * len(LEVELS) * 2 and set(last) == {80}
     assert (curves["processor_seconds"] > 0).all()
+    # Of 4 games of 10 steps, the first end before the first evaluation and the last before the last.
+    spent = curves[curves["game_steps"] == 80].set_index(["method", "task", "level", "seed"])["processor_seconds"]
+    trained = tests[tests["game_steps"] > 0].groupby(["method", "task", "train_level", "seed"])["processor_seconds"]
+    assert spent.to_dict() == pytest.approx(trained.first().to_dict())
 
 
 def test_results_that_are_not_there(tmp_path: Path) -> None:
@@ -262,6 +266,9 @@ def test_published_trainings_with_other_settings_have_names_of_their_own(folder:
     names = {"saf": 1, "saf (published)": 2, "random": 2}
     assert counts == names | ({"ippo": 2} if told else {"ippo": 1, "ippo (published)": 2})
     assert set(both.curves["method"]) == set(counts) - {"random"}
+    third = Frames(theirs.tests[saf].assign(training="third"), theirs.curves)
+    more = beside(both, third).tests.groupby("method")["seed"].nunique().to_dict()
+    assert more == counts | {"saf (published, 2)": 2}
 
 
 def test_aggregates_compare_like_with_like() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
@@ -211,7 +212,16 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     fake_run(tmp_path, 4, seed=1)
     figure = str(tmp_path / "curves.png")
     zoo_plot.main(["-f", str(tmp_path), "--source", "training", "-o", figure])
-    assert capsys.readouterr().err.count("left out: ") == 1  # the run without episodes
+    told = capsys.readouterr().err
+    assert told.count("left out: ") == 1 and "4" in told  # the run without episodes
+    (tmp_path / "saf" / f"{ENV}_1" / "finished.json").rename(tmp_path / "kept")
+    shutil.copytree(tmp_path / "saf" / f"{ENV}_1", tmp_path / "saf" / f"{ENV}_5")
+    (tmp_path / "kept").rename(tmp_path / "saf" / f"{ENV}_1" / "finished.json")
+    ours = json.loads((tmp_path / "saf" / f"{ENV}_5" / "run.json").read_text())
+    (tmp_path / "saf" / f"{ENV}_5" / "run.json").write_text(json.dumps({**ours, "seed": 2}))
+    zoo_plot.main(["-f", str(tmp_path), "--source", "training", "-o", figure])
+    assert f"{ENV}_5 is not finished, others of its method are" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "saf" / f"{ENV}_5")
     fake_run(tmp_path, 5, game_steps=40)  # as run 1, not finished
     assert [run.number for run in describe(find_runs(tmp_path))["run"]] == [1, 3, 4]
     assert "has no evaluations" in failed(["-f", str(tmp_path), "-o", figure], capsys, zoo_plot.main)

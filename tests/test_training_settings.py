@@ -67,6 +67,12 @@ def test_paper_hyperparameters(algo: str, gae_lambda: float, max_grad_norm: floa
     assert arguments["rollout_buffer_class"] is TeamRolloutBuffer
 
 
+def test_advantages_that_are_not_normalised_are_not_by_the_buffer_either() -> None:
+    for given, expected in (({}, True), ({"normalize_advantage": True}, True), ({"normalize_advantage": False}, False)):
+        settings = load_settings("mappo", ENV, "small", overrides=given)
+        assert ("rollout_buffer_kwargs" in settings.hyperparams) == expected
+
+
 def test_paper_optimizer() -> None:
     settings = load_settings("saf", ENV, "paper", overrides={"n_envs": 1, "n_steps": 2})
     group = settings.make_model(settings.make_env(0), 0, device="cpu").policy.optimizer.param_groups[0]

@@ -112,12 +112,14 @@ def test_unknown_studies_and_trials_are_one_line(tmp_path: Path, capsys: pytest.
 
 def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tune(tmp_path)
+    (tmp_path / "model.zip").touch()
     for other, words in (
         (("--algo", "mappo"), "algo was 'saf', now 'mappo'"),
         (("--env-kwargs", "coordination:2"), "coordination was 1, now 2"),
         (("--eval-env-kwargs", "coordination:2"), "eval_env_kwargs"),
         (("--eval-episodes", "2"), "eval_episodes was 4, now 2"),
         (("-params", "gamma:0.5"), "gamma"),
+        (("-i", str(tmp_path / "model.zip")), "initial_model"),
     ):
         line = failed(given(tmp_path, *other), capsys)
         assert "the trials of the study 's' cannot be compared with these" in line and words in line

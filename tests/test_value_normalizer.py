@@ -302,6 +302,8 @@ def test_shared_rewards_learn_as_before(how: str) -> None:
         assert ("rollout_buffer_kwargs" in settings) == (how == "by the game" or bool(kwargs))
         return PPO("MAPPOPolicy", env, **settings, seed=0).learn(16 * 4 * 2).policy.state_dict()
 
+    env = make_team_env(Arms, 2, seed=0)
+    assert "rollout_buffer_kwargs" not in ppo_settings(env, normalize_advantage=False)
     as_set, before = weights(), weights(rollout_buffer_kwargs={"ends": "own"})
     assert all(th.equal(as_set[name], before[name]) for name in before)
 

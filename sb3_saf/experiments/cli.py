@@ -208,11 +208,11 @@ def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
     if options.game_steps is not None:
         overrides["game_steps"] = options.game_steps
     varied = {name for view in experiment.views for level in view.levels for name in level.env_kwargs}
-    for name in options.env_kwargs:
+    if env_kwargs := {**(overrides.get("env_kwargs") or {}), **options.env_kwargs}:
+        overrides["env_kwargs"] = env_kwargs
+    for name in env_kwargs:
         if name in varied:
             raise ValueError(f"{name} is what the experiment varies; leave it out of --env-kwargs")
-    if options.env_kwargs:
-        overrides["env_kwargs"] = options.env_kwargs
     size = _size(options)
     episodes, eval_freq, eval_episodes = _SMOKE if size == "smoke" else _PROTOCOL
     return RunConfig(

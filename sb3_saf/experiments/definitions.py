@@ -363,7 +363,10 @@ class RunConfig:
         overrides = {key: value for key, value in self.overrides.items() if cell.is_trained or key in _OF_GAMES}
         overrides["env_kwargs"] = {**overrides.get("env_kwargs", {}), **level.env_kwargs}
         if of_method := find_method(cell.method).policy_kwargs:
-            overrides["policy_kwargs"] = {**overrides.get("policy_kwargs", {}), **of_method}
+            given = overrides.get("policy_kwargs", {})
+            if fixed := {key: value for key, value in of_method.items() if given.get(key, value) != value}:
+                raise ValueError(f"the method {cell.method} sets policy_kwargs {fixed}; leave them out, or the method")
+            overrides["policy_kwargs"] = {**given, **of_method}
         return overrides
 
     def settings(self, cell: Cell, level: Level | None = None) -> Settings:

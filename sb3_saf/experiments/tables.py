@@ -125,6 +125,11 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
     differs = rows["method"].isin(here["method"]) & (rows["method"] != RANDOM)
     differs &= ~keys_of(rows, *protocol).isin(keys_of(here, *protocol))
     other = {method: f"{method} (published)" for method in rows["method"][differs]}
+    for method, name in other.items():  # another folder may have published one, of other settings
+        told = keys_of(here[here["method"] == name], *protocol[1:])
+        if len(told) and not keys_of(rows[rows["method"] == method], *protocol[1:]).isin(told).all():
+            number = 1 + sum(one.startswith(name[:-1]) for one in set(here["method"]))
+            other[method] = f"{method} (published, {number})"
     rows, their_curves = (table.assign(method=table["method"].replace(other)) for table in (rows, theirs.curves))
     names = "method", "task", "train_level", "level", "seed"
     tests = rows[~keys_of(rows, *names).isin(keys_of(here, *names))]
@@ -285,7 +290,10 @@ def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
             names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, **cell.level.env_kwargs}
             evaluations, training = pd.read_csv(run.folder / EVALUATIONS), read_curve(run.folder)
             steps = evaluations["game_steps"].astype(float)
-            seconds = np.interp(steps, training["game_steps"], training["processor_seconds"])
+            # Games end between evaluations: before the first of them and after the last the run's ends are known.
+            known = [0, *training["game_steps"], run.settings.game_steps]
+            spent = [0, *training["processor_seconds"], run.finished()["processor_seconds"]]
+            seconds = np.interp(steps, known, spent)
             curve = pd.DataFrame(
                 {"game_steps": steps, "processor_seconds": seconds, "score": evaluations["return_mean"]}
             )

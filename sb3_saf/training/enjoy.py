@@ -32,7 +32,7 @@ from sb3_saf.training.commands import (
     run_command,
     user_errors,
 )
-from sb3_saf.training.folders import SAVED_MODEL, WEIGHTS, find_model, find_team, version_in_errors
+from sb3_saf.training.folders import FINISHED, SAVED_MODEL, WEIGHTS, find_model, find_team, version_in_errors
 from sb3_saf.training.settings import ALGOS, Settings, find_algorithm, saved_settings
 from sb3_saf.training.wrappers import load_normalization
 
@@ -111,10 +111,11 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
         print(f"{options.algo} on {options.env}, weights of {path}")
         print(f"team return {result}")
         saved = SAVED_MODEL.fullmatch(path.name)
-        game_steps = int(saved[1]) if saved else trained.game_steps
-        known = standing(environment, settings.env_kwargs, result.scores, game_steps)
-        if known is not None:
-            print(known.text)
+        if saved or options.team is not None or (run.folder / FINISHED).exists():
+            game_steps = int(saved[1]) if saved else trained.game_steps
+            known = standing(environment, settings.env_kwargs, result.scores, game_steps)
+            if known is not None:
+                print(known.text)
     return result
 
 

@@ -75,6 +75,12 @@ def _draw(options: argparse.Namespace) -> Figure:
         print(f"left out: {reason}", file=sys.stderr)
     table = describe(runs)
     table["setting"] = setting_names(table)
+    table["finished"] = [(run.folder / FINISHED).is_file() for run in table["run"]]
+    # Curves end where the shortest of a method ends.
+    is_cut = ~table["finished"] & table.groupby(["setting", "method"])["finished"].transform("any")
+    for run in table["run"][is_cut]:
+        print(f"left out: {run.folder} is not finished, others of its method are", file=sys.stderr)
+    table = table[~is_cut]
     for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
         if changes not in method:
             print(f"{method}: {changes}")

@@ -284,6 +284,8 @@ def load_settings(
         if given.get("n_minibatches") is not None:
             raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
         own.pop("n_minibatches", None)
+    if given.get("normalize_advantage") is False:
+        own.pop("rollout_buffer_kwargs", None)  # by which the buffer normalises those of each agent
     levels = entry_of(read_settings("levels"), environment.yaml_keys, size)
     last = {"env_kwargs": env_kwargs or {}, "policy_kwargs": dict(spec.policy_kwargs)}
     return _build(spec, algo, environment, size, merge(levels, own, given, last))
@@ -549,8 +551,8 @@ def ppo_settings(
     if not policy.takes_team_buffer:
         policy_kwargs.pop("normalize_values", None)
     policy_kwargs |= overrides.get("policy_kwargs") or {}
-    if shares_reward(env):
+    if shares_reward(env) or overrides.get("normalize_advantage") is False:
         found.pop("rollout_buffer_kwargs", None)
-    elif policy_kwargs.get("normalize_values") is True:
+    if not shares_reward(env) and policy_kwargs.get("normalize_values") is True:
         policy_kwargs["normalize_values"] = "agent"
     return {**found, **overrides, "policy_kwargs": policy_kwargs}
