@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import sys
 import warnings
 from collections.abc import Callable
 from copy import deepcopy
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,6 +35,7 @@ from sb3_saf import (
     evaluate_team,
     inspect_team,
     make_team_env,
+    resumable_learn,
 )
 from sb3_saf.training.wrappers import wrap_game, wrap_rows
 from tests.contrib_teams import MaskedGame
@@ -279,7 +281,126 @@ def test_bootstrapped_value_of_an_agent_stopped_alone() -> None:
     np.testing.assert_array_equal(ended.rollout_buffer.returns[:2, 0], [0, 0])
 
 
-# --- ends -------------------------------------------------------------------------------------------------------------
+# --- classes of scripts, generators, ends -----------------------------------------------------------------------------
+
+
+def test_a_class_of_a_script_stays_as_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    class Script(Game):
+        level = 0.0
+
+        def see(self, agent: Any) -> Any:
+            return np.full(2, self.level, np.float32)
+
+    Script.__module__, Script.__qualname__ = "__main__", "Script"
+    monkeypatch.setattr(sys.modules["__main__"], "Script", Script, raising=False)
+    env = make_team_env(Script, 2, seed=0)
+    Script.level = 0.5
+    obs: Any = env.reset()
+    assert (obs["obs"] == 0.5).all()
+    resumable_learn(ppo(env), 8 * 4, tmp_path)
+    obs = make_team_env(Script(), 2).reset()
+    assert Script.level == 0.5 and (obs["obs"] == 0.5).all()
+
+
+class Drawing(Game):
+    """
+    Agents see a number that is drawn in each episode.
+
+    :param how: where from
+    """
+
+    def __init__(self, how: str) -> None:
+        self.how, self.seed = how, 0
+        self.of_game = np.random.random()  # noqa: NPY002
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if seed is not None and self.how == "the last seed":
+            self.seed = seed
+        if seed is not None or not self.how.startswith("a generator kept"):
+            self.rng = np.random.default_rng(self.seed if seed is None else seed)
+        drawn = {"torch": lambda: th.rand(()).item(), "the game": lambda: self.of_game}
+        self.level = drawn.get(self.how, lambda: self.rng.random())()
+        return super().reset(seed, options)
+
+    def see(self, agent: Any) -> Any:
+        return np.full(2, self.level, np.float32)
+
+
+@pytest.mark.parametrize("how", ["torch", "the game"])
+def test_games_of_worker_processes_draw_differently(how: str) -> None:
+    env = make_team_env(partial(Drawing, how), 4, seed=0, n_cpus=2)
+    obs: Any = env.reset()
+    env.close()
+    assert len(np.unique(obs["obs"][::2, 0])) == 4
+
+
+@pytest.mark.parametrize("how", ["the last seed", "a seed of its own", "a generator kept"])
+def test_games_that_repeat_their_episodes_are_named(how: str) -> None:
+    env = make_team_env(partial(Drawing, how), 3, seed=0)
+    env.reset()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for _ in range(4 * 12):
+            env.step(np.zeros(6, int))
+    assert ["to make its generator anew at resets without a seed" in str(one.message) for one in told] == (
+        [] if how == "a generator kept" else [True]
+    )
+
+
+class Listing(Game):
+    """
+    An agent that has not acted is in ``agents`` after the step in which it ends.
+
+    :param how: whether ``agents`` is whoever moves next, or the second agent joins, in the last step
+    """
+
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def change(self, out: list[Any]) -> None:
+        self.agents = ["ab"[self.t % 2]] if self.how == "turns" else ["a", "b"] if self.t >= 4 else ["a"]
+        out[0], out[3] = dict.fromkeys("ab", ZEROS), dict.fromkeys("ab", self.t >= 4)
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        result = super().step(actions)
+        if self.t == 4:
+            self.agents = ["a", "b"]
+        return result
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        result = super().reset(seed, options)
+        self.agents = ["a"]
+        return result
+
+
+@pytest.mark.parametrize("how", ["turns", "join"])
+def test_ends_of_listed_agents_that_have_not_acted_count(how: str) -> None:
+    env = make_team_env(partial(Listing, how), seed=0)
+    env.reset()
+    assert [env.step(np.zeros(2, int))[2].tolist() for _ in range(4)] == [[False] * 2] * 3 + [[True] * 2]
+
+
+def test_possible_agents_that_lose_an_agent_after_the_trial_are_named() -> None:
+    class Alias(Game):
+        length = 40
+
+        def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            result = super().reset(seed, options)
+            self.agents = self.possible_agents
+            return result
+
+        def change(self, out: list[Any]) -> None:
+            if self.t == 35:
+                self.agents.remove("a")
+                out[2]["a"] = True
+
+    Alias.possible_agents = ["a", "b"]
+    env = make_team_env(Alias, seed=0)
+    env.reset()
+    for _ in range(39):
+        env.step(np.zeros(2, int))
+    with pytest.raises(ValueError, match=r"possible_agents at all times, got \['a', 'b'\], and \['b'\] at a reset of"):
+        env.step(np.zeros(2, int))
 
 
 class GymTeam(gym.Env[Any, Any]):
@@ -322,6 +443,29 @@ def test_gymnasium_teams_end_as_they_say(ends: Any, over_in: int) -> None:
     env.reset()
     dones = [bool(env.step(np.zeros(2, int))[2][0]) for _ in range(over_in)]
     assert dones == [False] * (over_in - 1) + [True]
+
+
+@pytest.mark.parametrize("names", [(0, 1), ("agent_0", "agent_1")])
+def test_infos_of_gymnasium_teams_may_be_by_agent(names: tuple[Any, ...]) -> None:
+    class Told(GymTeam):
+        def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+            return super().reset()[0], {name: {"action_mask": np.eye(2)[i]} for i, name in enumerate(names)}
+
+        def step(self, actions: Any) -> Any:
+            return *super().step(actions)[:4], self.reset()[1]
+
+    env = make_team_env(Told(lambda t: (False, False)))
+    assert env.reset()["action_mask"].tolist() == [[1, 0], [0, 1]]
+
+
+@cache
+def shared_team() -> GymTeam:
+    return GymTeam(lambda t: (False, False))
+
+
+def test_games_that_are_one_gymnasium_team_are_refused() -> None:
+    with pytest.raises(ValueError, match="returned the same object for 3 games"):
+        make_team_env(shared_team, 3)
 
 
 @pytest.mark.parametrize(

@@ -148,8 +148,9 @@ class Trial:
                         raise ValueError(
                             f"expected a finite number as the reward of {agent} {self._place}, got {reward}"
                         )
+                listed = {*playing, *self._playing(ended)}
                 for name, flags in (("terminations", terminations), ("truncations", truncations)):
-                    ended |= {agent for agent in playing if end_of(name, flags, agent, self._place)}
+                    ended |= {agent for agent in listed if end_of(name, flags, agent, self._place)}
                 playing = self._playing(ended)
 
     def _called(self, function: Callable[..., Any], *args: Any) -> Any:
@@ -163,13 +164,7 @@ class Trial:
             return None
 
     def _playing(self, ended: frozenset[Any]) -> list[Any]:
-        names = tuple(agents_of(self.env))
-        if names != self.agents:
-            raise ValueError(
-                f"expected the same possible_agents at all times, got {list(self.agents)}, and {list(names)} "
-                f"{self._place}; a game that sets self.agents = self.possible_agents removes agents from both: write "
-                "self.agents = list(self.possible_agents)"
-            )
+        check_agents(self.env, self.agents, self._place)
         present = present_agents(self.env, self.agents, self._place)
         return [agent for agent in self.agents if agent in present and agent not in ended]
 
@@ -356,6 +351,16 @@ def agents_of(env: Any) -> list[Any]:
     """Return ``possible_agents`` as a list; games also give arrays, and keys of dicts."""
     agents = getattr(env, "possible_agents", None)
     return agents.tolist() if isinstance(agents, np.ndarray) else [] if agents is None else list(agents)
+
+
+def check_agents(env: Any, agents: Sequence[Any], place: str) -> None:
+    """Raise ValueError if ``possible_agents`` are not the agents that a game began with."""
+    if (names := agents_of(env)) != list(agents):
+        raise ValueError(
+            f"expected the same possible_agents at all times, got {list(agents)}, and {names} {place}; a game that "
+            "sets self.agents = self.possible_agents removes agents from both: write "
+            "self.agents = list(self.possible_agents)"
+        )
 
 
 def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:

@@ -14,6 +14,7 @@ import os
 import pickle
 import random
 import secrets
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -61,6 +62,11 @@ class ForeignGamesError(CheckpointError):
 _Place: TypeAlias = tuple[int, str]
 
 
+def is_found_by_name(one: type) -> bool:
+    """Return whether a class is found in its module by its name, as those inside of functions are not."""
+    return getattr(sys.modules.get(one.__module__), one.__qualname__, None) is one
+
+
 class _Pickler(cloudpickle.Pickler):
     """
     Pickler that also stores the state of :class:`gymnasium.utils.EzPickle`, which stores constructor arguments only.
@@ -76,6 +82,8 @@ class _Pickler(cloudpickle.Pickler):
         return self._left_out.get(id(obj))
 
     def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, type) and is_found_by_name(obj):
+            return NotImplemented  # by name, also if it is of a script: see supersuit_games
         if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
             # Attributes are set one by one, without the class's own __setstate__.
             return copyreg.__newobj__, (type(obj),), dict(vars(obj)), None, None, _set_attributes  # type: ignore[attr-defined]

@@ -120,16 +120,20 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
     def _by_agent(self, what: str, values: Any) -> dict[str, Any]:
         """Return values by agent, from one for each agent in order, or a dict by the agents' names or indices."""
         agents = self.possible_agents
-        if isinstance(values, Mapping):
-            for names in (agents, range(len(agents)), list(map(str, range(len(agents))))):
-                if set(names) <= set(values):
-                    return {agent: values[name] for agent, name in zip(agents, names, strict=True)}
+        if isinstance(values, Mapping) and (names := self._names_in(values)) is not None:
+            return {agent: values[name] for agent, name in zip(agents, names, strict=True)}
         if not isinstance(values, (Sequence, np.ndarray)) or len(values) != len(agents):
             raise ValueError(
                 f"expected {what} of {len(agents)} agents from {self.env}, got {values!r:.200}; an environment with "
                 "one value for all agents must give it to each: [value] * n_agents"
             )
         return dict(zip(agents, values, strict=True))
+
+    def _names_in(self, values: Mapping[Any, Any]) -> Sequence[Any] | None:
+        """Return the names or indices of the agents by which a dict has values; None if it has other keys."""
+        indices = range(len(self.possible_agents))
+        kinds: tuple[Sequence[Any], ...] = (self.possible_agents, indices, list(map(str, indices)))
+        return next((names for names in kinds if set(names) <= set(values)), None)
 
     def _ends(self, what: str, value: Any) -> dict[str, bool]:
         """Return which agents have ended: one flag for all, one for each, or a dict, also with ``"__all__"``."""
@@ -147,7 +151,10 @@ class GymnasiumTeam(ParallelEnv[str, Any, Any]):
 
     def _infos(self, info: Any) -> dict[str, dict[str, Any]]:
         """Copy the info of all agents, or a list of one for each; lists of masks become each agent's own."""
-        if not isinstance(info, Mapping):
+        names = self._names_in(info) if isinstance(info, Mapping) else None
+        if not isinstance(info, Mapping) or (
+            names is not None and all(isinstance(info[one], Mapping) for one in names)
+        ):
             return {agent: dict(own) for agent, own in self._by_agent("infos", info).items()}
         infos = {agent: dict(info) for agent in self.possible_agents}
         for key in MASK_NAMES:

@@ -8,6 +8,8 @@ our own code.
 
 from __future__ import annotations
 
+import io
+import pickle
 import random
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,12 +20,13 @@ from typing import Any, Final, TypeAlias
 import cloudpickle
 import numpy as np
 import numpy.typing as npt
+import torch as th
 from gymnasium.vector.utils import iterate
 from supersuit.vector import ConcatVecEnv, MarkovVectorEnv
 
 from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
-from sb3_saf.envs.game_copies import Way, find_way, pickled, unpickled
+from sb3_saf.envs.game_copies import Way, find_way, is_found_by_name, pickled, unpickled
 from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
 from sb3_saf.envs.gymnasium_team import as_parallel
 from sb3_saf.teams.conversion import MASK_NAMES
@@ -92,6 +95,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         """
         observations, infos = audit.reset(self.par_env, seed, options)
         self._count_step(0)
+        audit.check_agents(self.par_env, self.agents, f"at a reset of game {self._index}")
         self._ended.clear()
         self._playing = self._find_playing()
         if not self._playing:
@@ -114,6 +118,11 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         self._note_respawned(terminations, truncations)
         self._ended |= terminated | truncated
         self._playing = self._find_playing()
+        flags = ("terminations", terminations), ("truncations", truncations)
+        for agent in self._playing.keys() - acted.keys():  # the flags of agents that are listed count, too
+            if any(audit.end_of(name, given, agent, self._place) for name, given in flags):
+                self._ended.add(agent)
+                del self._playing[agent]
         row_infos = self._infos(infos, acted)
         over = not self._playing
         if over or terminated or truncated:
@@ -228,7 +237,11 @@ def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], A
     :raises ValueError: if it cannot be copied, with a fix
     """
     try:
-        return partial(_unpickled_game, cloudpickle.dumps(make_env), is_factory)
+        if n_cpus > 1:
+            cloudpickle.dumps(make_env)
+        file, classes = io.BytesIO(), {}
+        _Pickler(file, classes).dump(make_env)
+        return partial(_unpickled_game, file.getvalue(), classes, is_factory)
     except Exception as error:
         if n_cpus > 1:
             raise ValueError(
@@ -240,8 +253,38 @@ def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], A
     return lambda: as_parallel(make())
 
 
-def _unpickled_game(pickled_env: bytes, is_factory: bool) -> Any:
-    content = cloudpickle.loads(pickled_env)
+class _Pickler(cloudpickle.Pickler):
+    """
+    Pickler that leaves classes of scripts, notebooks and functions out: where they are unpickled, cloudpickle sets the
+    attributes of the class that is there to those of the pickle.
+
+    :param classes: gets them, by id
+    """
+
+    def __init__(self, file: io.BytesIO, classes: dict[int, type]) -> None:
+        super().__init__(file)
+        self._classes = classes
+
+    def persistent_id(self, obj: Any) -> int | None:
+        if not isinstance(obj, type) or (is_found_by_name(obj) and obj.__module__ != "__main__"):
+            return None
+        self._classes[id(obj)] = obj
+        return id(obj)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Unpickler for the output of :class:`_Pickler`."""
+
+    def __init__(self, data: bytes, classes: Mapping[int, type]) -> None:
+        super().__init__(io.BytesIO(data))
+        self._classes = classes
+
+    def persistent_load(self, pid: Any) -> type:
+        return self._classes[pid]
+
+
+def _unpickled_game(pickled_env: bytes, classes: Mapping[int, type], is_factory: bool) -> Any:
+    content = _Unpickler(pickled_env, classes).load()
     return as_parallel(content() if is_factory else content)
 
 
@@ -255,6 +298,12 @@ def _copied_game(env: Any) -> Any:
         ) from error
 
 
+def _seed_generators(seed: int) -> None:
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    th.manual_seed(seed)
+
+
 class TeamConcatVecEnv(ConcatVecEnv):
     """
     Games of one process, one after another.
@@ -263,8 +312,8 @@ class TeamConcatVecEnv(ConcatVecEnv):
     of games are accessible, and all games are closed even if closing one fails.
 
     :param indices: indices of the games among all E
-    :param is_worker: whether the process has no other games: it then seeds the global generators of Python and NumPy,
-        from which games may draw, since processes are forked with equal ones
+    :param is_worker: whether the process has no other games: it then seeds the global generators of Python, NumPy and
+        torch, from which games may draw, since processes are forked with equal ones
     :raises ValueError: if the same environment is made twice
     """
 
@@ -274,6 +323,8 @@ class TeamConcatVecEnv(ConcatVecEnv):
         self._notes: list[str] = []
         self._indices = indices
         self._is_worker = is_worker
+        if is_worker:
+            _seed_generators(random.getrandbits(32) + indices[0])
         self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, close also runs if construction failed
         super().__init__(
             [lambda index=index: TeamMarkovVectorEnv(make_game(), reader, index, self._notes) for index in indices]
@@ -281,7 +332,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
         self._n_agents = len(reader.agents)
         self._new_game = lambda: TeamMarkovVectorEnv(make_game(), reader, indices[0], [])
         self._way: Way | None = None
-        n_objects = len({id(game.par_env.unwrapped) for game in self.vec_envs})
+        n_objects = len({id(audit.layers_of(game.par_env)[-1]) for game in self.vec_envs})
         if n_objects < len(self.vec_envs):
             raise ValueError(
                 "expected a function that makes a new environment at each call, got one that returned the same object "
@@ -295,8 +346,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """Begin an episode in every game of this process; seeds and options are those of all E games."""
         if self._is_worker and (seed := seeds[self._indices[0]]) is not None:
-            random.seed(seed)
-            np.random.seed(seed % 2**32)  # noqa: NPY002
+            _seed_generators(seed)
         games = zip(self._indices, self.vec_envs, strict=True)
         started = [game.reset(seed=seeds[index], options=options[index]) for index, game in games]
         observations, infos = zip(*started, strict=True)

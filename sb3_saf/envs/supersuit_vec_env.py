@@ -172,8 +172,15 @@ class SuperSuitVecEnv(TeamVecEnv):
             self._beginnings[game].append(hash(b"".join(part[rows].tobytes() for part in parts)))
         if min(map(len, self._beginnings)) < _N_BEGINNINGS:
             return []
-        first, *others = (beginnings[:_N_BEGINNINGS] for beginnings in self._beginnings)
+        first, *others = every = [beginnings[:_N_BEGINNINGS] for beginnings in self._beginnings]
         self._beginnings = []
+        are_kept = all(len(set(beginnings[1:])) == 1 for beginnings in every)
+        if are_kept and len(set().union(*every)) > 1:
+            return [
+                f"each game began its second to last of {_N_BEGINNINGS} episodes alike, although games, or first "
+                "episodes, differ: the game seems to make its generator anew at resets without a seed; if episodes "
+                "should differ, make it only if seed is not None: self.rng = np.random.default_rng(seed)"
+            ]
         if len(set(first)) == 1 or any(other != first for other in others):
             return []
         return [
