@@ -100,6 +100,18 @@ def test_masks_that_are_not_always_used_are_named(game: dict[str, Any], message:
         make_team_env(MaskedGame, seed=0, **game)
 
 
+@pytest.mark.parametrize(
+    ("observed", "message"),
+    [
+        ([spaces.Dict(view=spaces.Dict(x=BOX, action_mask=spaces.MultiBinary(3)))], "'action_mask' inside of 'view'"),
+        ([spaces.Box(0, 1000, (2,), np.int32), spaces.Box(0, 1, (2,), np.int32)], r"integers up to \[1.0, 1000.0\]"),
+    ],
+)
+def test_observations_that_are_not_read_as_meant_are_named(observed: list[Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=message):
+        make_team_env(Showing(*observed), seed=0)
+
+
 def test_masks_that_come_after_the_trial_are_named() -> None:
     game = MaskedGame("info:action_mask", given=lambda step: step > 32)
     game.length = 40

@@ -328,6 +328,12 @@ def failed(
     return line
 
 
+def test_mappings_that_are_given_in_parts_are_merged() -> None:
+    parts = ("gamma:0.9", "policy_kwargs:{n_slots: 8, n_policies: 2}", "policy_kwargs:{n_policies: 3}", "gamma:0.8")
+    options = zoo_train.make_parser().parse_args(["--algo", "saf", "-params", *parts])
+    assert options.hyperparams == {"gamma": 0.8, "policy_kwargs": {"n_slots": 8, "n_policies": 3}}
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -345,6 +351,7 @@ def failed(
         (["--gym-packages", "nowhere"], ("--gym-packages: cannot import 'nowhere'",)),
         (["--vec-env", "subproc"], ("n_cpus=2", "TeamTogether-v0")),
         (["-n", "0"], ("--game-steps: must be at least 1, got 0",)),
+        (["-optimize", "--track"], ("--track is for training",)),
     ],
 )
 def test_mistakes_are_one_line(

@@ -93,6 +93,12 @@ class Trial:
     def _mask_key(self, agent: Any) -> Any:
         """Find the masks among the entries of observations; note what looks like masks and is none."""
         observed, n_entries = self.observed[agent], n_mask_entries(self.actions[agent])
+        for path, _ in innermost(observed):
+            for key in filter(looks_like_mask, path[1:]):
+                self._note(
+                    f"observations have {key!r} inside of {path[0]!r}: it is an ordinary part of the observation; "
+                    f"masks of actions are {ACTION_MASK_KEY!r} beside {path[0]!r}"
+                )
         if not isinstance(observed, spaces.Dict) or len(observed.spaces) < 2:
             return None
         masks = {key: space for key, space in observed.spaces.items() if looks_like_mask(key)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
 from itertools import accumulate, pairwise
-from typing import Any, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
@@ -32,6 +32,10 @@ MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
 
 #: Whether to use action masks: if there are any, always (required), never.
 AskMasks: TypeAlias = Literal["auto"] | bool
+
+
+#: Ratio of the bounds of agents' integers that is warned of.
+_UNEQUAL: Final = 10
 
 
 class GameReader:
@@ -64,6 +68,14 @@ class GameReader:
                 "the pictures in the agents' observations are read as plain numbers, without convolutions, because "
                 f"they are of different kinds or places: {', '.join(map(str, own_spaces))}; give all agents the same "
                 "picture, as the first part of their Dicts"
+            )
+        largest = {
+            float(box.high.max()) for box in own_spaces if isinstance(box, spaces.Box) and box.dtype.kind in "iu"
+        }
+        if len(largest) > 1 and max(largest) >= _UNEQUAL * min(largest):
+            self.notes.append(
+                f"the agents' observations are integers up to {sorted(largest)}, all of which encoders divide by the "
+                "bounds of the largest: they hardly see the small ones; scale observations to equal ranges in the game"
             )
         #: Action space of a row.
         self.action_space = common_actions(acted)

@@ -239,7 +239,8 @@ def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], A
     try:
         if n_cpus > 1:
             cloudpickle.dumps(make_env)
-        file, classes = io.BytesIO(), {}
+        file = io.BytesIO()
+        classes: dict[int, type] = {}
         _Pickler(file, classes).dump(make_env)
         return partial(_unpickled_game, file.getvalue(), classes, is_factory)
     except Exception as error:

@@ -71,7 +71,9 @@ class KeyValues(argparse.Action):
             if not colon or not key or not value:
                 parser.error(f"{option_string} expects key:value, such as coordination:2, got {text!r}")
             try:
-                pairs[key] = load_yaml(value, f"the value {reprlib.repr(value)}")
+                given, before = load_yaml(value, f"the value {reprlib.repr(value)}"), pairs.get(key)
+                are_merged = isinstance(given, dict) and isinstance(before, dict)
+                pairs[key] = {**before, **given} if are_merged else given
             except ValueError as error:
                 parser.error(str(error))
         setattr(namespace, self.dest, pairs)

@@ -184,6 +184,8 @@ def _check(options: argparse.Namespace) -> None:
             "--resume is for training with settings, without -optimize and --trial-id; a study goes on by itself when "
             "it is called again, and a trial's settings can be given with -params"
         )
+    if options.optimize_hyperparameters and options.track:
+        raise CommandError("--track is for training: -optimize keeps its trials in the study; leave it out")
     model = options.trained_agent
     if model is not None and not (model.suffix == ".zip" and model.is_file()):
         raise CommandError(f"--trained-agent must be a .zip that is there, got {str(model)!r}")
