@@ -546,13 +546,13 @@ def _given(
     if len(shapes := {array.shape for array in own}) > 1:
         raise ValueError(f"expected observations of one shape, that of rows, {team.own_shape}, got {sorted(shapes)}")
     rows = {OBS: np.stack(own)} | ({} if indices is None else {AGENT: np.array(indices)})
-    given = [np.asarray(mask) for mask in legal if mask is not None]
     action_masks = None
-    if takes_masks and given:  # an agent without a mask has all of its actions
-        whole = [np.ones_like(given[0])] * len(own) if conversions is None else [one.mask(None) for one in conversions]
-        action_masks = np.stack(
-            [other if mask is None else np.asarray(mask) for mask, other in zip(legal, whole, strict=True)]
-        )
+    given = [np.asarray(mask) for mask in legal if mask is not None]
+    if takes_masks and given:
+        for number, mask in enumerate(legal):
+            if mask is None:  # the agent has all of its actions
+                legal[number] = np.ones_like(given[0]) if conversions is None else conversions[number].mask(None)
+        action_masks = np.stack([np.asarray(mask) for mask in legal])
     if action_masks is not None and team.has_masks:
         rows, action_masks = {**rows, ACTION_MASK: action_masks}, None
     return Given(rows, action_masks, conversions, agents)
