@@ -72,8 +72,7 @@ class KeyValues(argparse.Action):
                 parser.error(f"{option_string} expects key:value, such as coordination:2, got {text!r}")
             try:
                 given, before = load_yaml(value, f"the value {reprlib.repr(value)}"), pairs.get(key)
-                are_merged = isinstance(given, dict) and isinstance(before, dict)
-                pairs[key] = {**before, **given} if are_merged else given
+                pairs[key] = {**before, **given} if isinstance(given, dict) and isinstance(before, dict) else given
             except ValueError as error:
                 parser.error(str(error))
         setattr(namespace, self.dest, pairs)
