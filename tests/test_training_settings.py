@@ -206,6 +206,7 @@ def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
         ("default: {n_envs: 2, n_envs: 3}", "'n_envs' is there twice"),
         ("default: {sizes: {tiny: {}}}", "unknown size 'tiny'"),
         ("TeamTogeter-v0: {}", "did you mean 'TeamTogether-v0'"),
+        ("hecogrid/TeamTogether-v0: {}", "did you mean 'TeamTogether-v0'"),
         ("base: sfa", "did you mean 'saf'"),
         ("default: {n_envs: !!python/object/apply:os.getcwd []}", "not valid YAML"),
     ],

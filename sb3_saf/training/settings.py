@@ -261,7 +261,7 @@ def load_settings(
     content, source = read_settings(config or method.config), str(config or f"zoo_configs/{method.config}.yml")
     known = (DEFAULT, *suites(), *suites()[HOME].tasks, environment.id)
     for key in content:
-        if key not in known and not {".", ":", "/"} & set(str(key)):
+        if key not in known and (str(key).startswith(f"{HOME}/") or not {".", ":", "/"} & set(str(key))):
             raise ValueError(f"{source}: {unknown_name('environment', key, known)}")
     own, given = entry_of(content, environment.yaml_keys, size), overrides or {}
     spec = find_algorithm(algo, given.get("algorithm", own.get("algorithm")))
