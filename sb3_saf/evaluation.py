@@ -23,7 +23,7 @@ from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array, NormalizedSpace
-from sb3_saf.teams.vec_env import episode_value, find_n_agents, layers, team_dones
+from sb3_saf.teams.vec_env import episode_value, find_n_agents, layers, share_of_sum, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -399,7 +399,7 @@ def evaluate_team(
             UserWarning,
             stacklevel=2,
         )
-    n_games = env.num_envs // n_agents
+    n_games, share = env.num_envs // n_agents, share_of_sum(env)
     returns: list[float] = []
     lengths: list[int] = []
     successes: list[bool] = []
@@ -411,7 +411,7 @@ def evaluate_team(
         lengths_now += 1
         for i in np.flatnonzero(step.counted).tolist():
             infos = step.infos[i * n_agents : (i + 1) * n_agents]
-            info, reward, done = infos[0], float(rewards[i].sum()), bool(step.ended[i])
+            info, reward, done = infos[0], float(rewards[i].sum() * share), bool(step.ended[i])
             if callback is not None:
                 callback(locals(), globals())
             if not done or STAGGERED in info:

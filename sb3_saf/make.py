@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import gymnasium as gym
 from pettingzoo import AECEnv, ParallelEnv
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_saf.envs.curriculum import Curriculum, Stage
@@ -43,7 +44,7 @@ def make_team_env(
     seed: int | None = None,
     backend: Backend | None = None,
     time_limit: TimeLimit = "terminal",
-    monitor_dir: str | None = None,
+    monitor_dir: str | os.PathLike[str] | None = None,
     n_cpus: int = 1,
     *,
     active: bool | None = None,
@@ -103,6 +104,8 @@ def make_team_env(
     check_count("n_cpus", n_cpus)
     if monitor_dir is not None and os.path.exists(monitor_dir) and not os.path.isdir(monitor_dir):
         raise ValueError(f"monitor_dir must be a folder, which is created if missing; {monitor_dir} is a file")
+    check_choice("active", active, (None, True, False))
+    check_choice("action_masks", action_masks, ("auto", True, False))
     if backend is not None:
         check_choice("backend", backend, get_args(Backend))
     if team_reward is not None:
@@ -119,6 +122,7 @@ def make_team_env(
     venv = make(seed, params) if not curriculum else _in_stages(make, seed, params, curriculum)
     if monitor_dir is not None:
         os.makedirs(monitor_dir, exist_ok=True)
+        monitor_dir = os.path.join(monitor_dir, Monitor.EXT)
     venv = TeamMonitor(venv, filename=monitor_dir, team_return="sum" if suite is None else suite.team_return)
     if team_reward is None:
         team_reward = "given" if suite is None else suite.team_reward

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
-from sb3_saf.teams.rows import TeamSpaces
+from sb3_saf.teams.rows import AgentSpace, TeamSpaces
 from sb3_saf.teams.vec_env import find_n_agents
 from tests.team_venv import VECTOR, Array, TeamVenv, see_where, still
 from tests.toy_teams import CodeSpace
@@ -300,3 +300,11 @@ def test_numbers_of_a_larger_kind_are_cast_to_the_space() -> None:
     obs = env.step(still(env))[0]
     assert isinstance(obs, dict)
     assert obs["obs"].dtype == obs["team"].dtype == np.float32
+
+
+def test_agents_in_other_places_are_another_team() -> None:
+    here = AgentSpace(3, ("a", "b", "c"))
+    for names, is_equal in ((("a", "b", "c"), True), (("x", "y", "z"), True), (("a", "x", "c"), True), (None, True)):
+        assert (here == AgentSpace(3, names)) == is_equal
+    for names in (("b", "c", "a"), ("b", "c", "x")):
+        assert here != AgentSpace(3, names)

@@ -15,6 +15,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
 
 from sb3_saf import QPLEX, make_team_env, ppo_settings
+from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.rows import n_mask_entries
 from tests.contrib_teams import random_masks
 
@@ -178,6 +179,9 @@ def test_masks_are_passed_by_agent() -> None:
         masks = dict.fromkeys(observations, np.eye(3)[action])
         assert model.predict(observations, action_masks=masks)[0] == dict.fromkeys(observations, action)
         assert model.predict(observations["b"], action_masks=masks["b"])[0] == action
+    seen = spaces.Box(0, 1, (1,))
+    conversion = AgentConversion.of(seen, spaces.Discrete(2), seen, spaces.Discrete(3))
+    assert conversion.mask([0, 1, 1]).tolist() == [0, 1, 0], "a mask of rows allows no action that the agent lacks"
     for _ in range(5):  # whoever has no mask may do everything
         partly = {**dict.fromkeys(observations), "b": np.eye(3)[2]}
         assert model.predict(observations, action_masks=partly, deterministic=False)[0]["b"] == 2

@@ -240,6 +240,29 @@ def test_wide_integers_are_scaled() -> None:
     assert th.equal(narrow(th.tensor(x)), expected(th.tensor(x).float()))
 
 
+@pytest.mark.parametrize(
+    ("encoder", "shape"),
+    [
+        (PaperCNN, (11, 10, 3)),
+        (NatureEncoder, (67, 40, 1)),
+        (ObservationEncoder, (12, 12, 15)),  # five frames of 12 x 12, not 12 of 12 x 15
+    ],
+)
+def test_every_pixel_is_read(encoder: type[BaseFeaturesExtractor], shape: tuple[int, ...]) -> None:
+    th.manual_seed(0)
+    pictures = th.rand(16, *shape, requires_grad=True)
+    reader = encoder(spaces.Box(0, 255, shape, np.uint8))
+    reader(pictures).square().sum().backward()
+    assert pictures.grad is not None and bool((pictures.grad.abs().sum(0) > 0).all())
+    assert next(layer for layer in reader.modules() if isinstance(layer, nn.Conv2d)).in_channels == shape[2]
+
+
+@pytest.mark.parametrize(("high", "dtype"), [(255, np.float32), (255, np.int64), (1000, np.int32)])
+def test_pictures_for_a_named_encoder_are_scaled(high: int, dtype: Any) -> None:
+    pixels = PaperCNN(spaces.Box(0, high, (12, 12, 3), dtype)).pixels
+    assert pixels(th.full((1, 12, 12, 3), float(high))).max() == 1
+
+
 def test_bytes_beside_a_picture_are_scaled() -> None:
     bounds = np.zeros(50), np.array([255] * 48 + [255, 1])
     space = PartsSpace(spaces.Box(*bounds, dtype=np.float64), (Part(0, 48, spaces.Box(0, 255, (4, 4, 3), np.uint8)),))

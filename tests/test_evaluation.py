@@ -79,6 +79,12 @@ class TestEvaluatePolicy:
         result = evaluate_team(StillPolicy(), env, n_episodes)
         assert [result.returns.count(value) for value in (4, 40, 400)] == per_game
 
+    @pytest.mark.parametrize("team_reward", ["given", "sum", "mean"])
+    def test_callbacks_get_the_teams_reward(self, team_reward: Any) -> None:
+        env, seen = make_team_env(CounterEnv, 2, seed=0, team_reward=team_reward), []
+        result = evaluate_team(RandomPolicy(env, 0), env, 2, callback=lambda known, _: seen.append(known["reward"]))
+        assert sum(seen) == pytest.approx(sum(result.returns)) != 0
+
     def test_rewards_are_those_before_normalisation(self) -> None:
         env = VecNormalize(teams(lengths=(3, 2), reward=constant(1, 10)), norm_obs=False, training=False)
         env.ret_rms.var = np.array(25.0)
@@ -398,6 +404,8 @@ def test_training_does_not_go_on_in_games_that_an_evaluation_has_played(algorith
     model.set_env(model.get_env())
     model.learn(8 * env.num_envs, reset_num_timesteps=False)
     assert model.num_timesteps >= 16 * env.num_envs
+    with pytest.raises(ValueError, match="not trained on, got the games of training themselves"):
+        model.learn(8 * env.num_envs, TeamEvalCallback(env, eval_freq=8))
 
 
 class TestTeamEvalCallback:

@@ -24,6 +24,7 @@ from sb3_saf import (
     CentralizedValueWrapper,
     GameStepsCallback,
     RandomPolicy,
+    TeamMonitor,
     TeamRolloutBuffer,
     make_team_env,
     ppo_settings,
@@ -87,6 +88,12 @@ def test_a_factory_with_parameters() -> None:
         (lambda: make_team_env("TeamSupport", stagger=True, backend="supersuit"), "stagger=True .*TeamSupport-v0"),
         (lambda: make_team_env(CounterEnv, stagger=True), "stagger=True .*CounterEnv"),
         (lambda: make_team_env(CounterEnv, curriculum=[(10, {})]), r"curriculum .*Stage.*got \(10, \{\}\)"),  # type: ignore[list-item]
+        (lambda: make_team_env(CounterEnv, active="no"), "active must be one of None, True, False, got 'no'"),  # type: ignore[arg-type]
+        (lambda: make_team_env(CounterEnv, action_masks="yes"), "action_masks must be one of .*got 'yes'"),  # type: ignore[arg-type]
+        (lambda: ppo_settings(CounterEnv()), "expected a VecEnv of flattened teams, got .*make_team_env"),
+        (lambda: CentralizedValueWrapper(CounterEnv), "expected a VecEnv of flattened teams"),  # type: ignore[arg-type]
+        (lambda: TeamMonitor(CounterEnv()), "expected a VecEnv of flattened teams"),
+        (lambda: TeamMonitor(TeamVenv(), team_return="max"), "team_return must be one of 'sum', 'mean', got 'max'"),  # type: ignore[arg-type]
         (lambda: make_team_env(CounterEnv, monitor_dir=__file__), f"monitor_dir .*{__file__} is a file"),
     ],
 )

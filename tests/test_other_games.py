@@ -40,6 +40,7 @@ from sb3_saf import (
 from sb3_saf.training.wrappers import wrap_game, wrap_rows
 from tests.contrib_teams import MaskedGame
 from tests.toy_envs import BOX, ZEROS, CounterEnv, Game
+from tests.toy_teams import CodeSpace
 
 
 def ppo(env: Any, **kwargs: Any) -> PPO:
@@ -104,6 +105,7 @@ def test_masks_that_are_not_always_used_are_named(game: dict[str, Any], message:
     ("observed", "message"),
     [
         ([spaces.Dict(view=spaces.Dict(x=BOX, action_mask=spaces.MultiBinary(3)))], "'action_mask' inside of 'view'"),
+        ([spaces.Dict(view=CodeSpace(), energy=BOX)], "tile codes beside other entries"),
         ([spaces.Box(0, 1000, (2,), np.int32), spaces.Box(0, 1, (2,), np.int32)], r"integers up to \[1.0, 1000.0\]"),
     ],
 )
@@ -743,6 +745,7 @@ def test_float64_becomes_float32() -> None:
 
 def test_the_audit_accepts_a_good_game_and_raises_the_errors_of_the_game() -> None:
     check_team_env(Game())
+    check_team_env(Game)
     check_team_env(GymTeam(lambda t: (t >= 3, False)))
 
     class Broken(Game):

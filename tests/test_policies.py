@@ -18,9 +18,10 @@ from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
+from torch import nn
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy, TeamRolloutBuffer
-from sb3_saf.networks.layers import Linear
+from sb3_saf.networks.layers import Linear, NormalizedReLU, mlp, side_by_side
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
 from sb3_saf.registration import DECLARATIONS, register
@@ -620,3 +621,14 @@ def test_parts_can_be_replaced() -> None:
     doubled, plain = make_policy(DoubledPolicy), make_policy(MAPPOPolicy)
     obs = team_rows(VECTOR)
     assert th.equal(doubled.predict_values(obs), 2.0 * plain.predict_values(obs))
+
+
+@pytest.mark.parametrize("activation", [nn.PReLU, NormalizedReLU, nn.Tanh])
+def test_nets_side_by_side_have_activations_of_their_own(activation: type[nn.Module]) -> None:
+    nets = [mlp((5, 7, 7, 3), activation) for _ in range(4)]
+    with th.no_grad():
+        for number, net in enumerate(nets):
+            for parameter in net.parameters():
+                parameter.add_(0.1 * number)
+        x = th.randn(6, 5)
+        th.testing.assert_close(side_by_side([nets[:3], nets[3:]], x)[0][1], nets[1](x))

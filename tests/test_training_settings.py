@@ -191,6 +191,10 @@ def test_layers_of_a_file(tmp_path: Path) -> None:
         ({"overrides": {"rollout_buffer_class": "os.system"}}, "unknown rollout_buffer_class"),
         ({"algo": "saf-no-pool", "overrides": {"policy_kwargs": {"n_policies": 4}}}, "n_policies is fixed to 1"),
         ({"config": Path("nowhere.yml")}, "nowhere.yml"),
+        (
+            {"env_id": "tests.toy_envs:CounterEnv", "env_kwargs": {"active": False}},
+            r"\['active'\] of env_kwargs are arg",
+        ),
     ],
 )
 def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:

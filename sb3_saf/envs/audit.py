@@ -12,6 +12,7 @@ from copy import deepcopy
 from math import isfinite, isnan
 from typing import Any, Final
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -43,12 +44,14 @@ def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None
     Agents, spaces, observations, rewards, ends, infos and action masks are checked until the first episode ends.
     ``make_team_env`` does the same for 30 steps, on a copy of the game.
 
-    :param env: PettingZoo ParallelEnv or Gymnasium environment of several agents; it is reset and played
+    :param env: PettingZoo ParallelEnv or Gymnasium environment of several agents, which is reset and played, or a
+        function that makes one
     :param n_steps: maximum number of steps
     :param seconds: time limit in seconds
     :raises ValueError: naming the agent, the step, what was expected, and what the game gave
     """
-    game = as_parallel(env)
+    is_made = isinstance(env, (ParallelEnv, AECEnv, gym.Env)) or not callable(env)
+    game = as_parallel(env if is_made else env())
     check_is_parallel(game, is_factory=False)
     trial = Trial(game)
     trial.play(n_steps, seconds)

@@ -63,11 +63,17 @@ class GameReader:
         own = own_space(own_spaces)
         inner = getattr(getattr(trial.env, "unwrapped", None), "observation_spaces", None)
         check_codes_are_kept(own, inner.values() if isinstance(inner, Mapping) else ())
-        if not has_pictures(own) and any(_is_picture(leaf) for space in own_spaces for _, leaf in innermost(space)):
+        leaves = [leaf for space in own_spaces for _, leaf in innermost(space)]
+        if not has_pictures(own) and any(map(_is_picture, leaves)):
             self.notes.append(
                 "the pictures in the agents' observations are read as plain numbers, without convolutions, because "
                 f"they are of different kinds or places: {', '.join(map(str, own_spaces))}; give all agents the same "
                 "picture, as the first part of their Dicts"
+            )
+        if any(hasattr(leaf, "atlas") for leaf in leaves) and not hasattr(own, "atlas"):
+            self.notes.append(
+                "tile codes beside other entries are read as plain numbers, without their pixels; give the agents the "
+                "codes alone, or pixels (HECOGrid: observation='rgb')"
             )
         largest = {
             float(box.high.max()) for box in own_spaces if isinstance(box, spaces.Box) and box.dtype.kind in "iu"

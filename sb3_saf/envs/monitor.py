@@ -18,6 +18,7 @@ from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_saf.teams.checks import check_choice
 from sb3_saf.teams.rows import IS_SUCCESS
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, episode_value, team_dones
 
@@ -57,13 +58,14 @@ class TeamMonitor(TeamVecEnvWrapper):
     def __init__(
         self,
         venv: VecEnv,
-        filename: str | None = None,
+        filename: str | os.PathLike[str] | None = None,
         info_keywords: tuple[str, ...] = (),
         n_agents: int | None = None,
         team_return: Literal["sum", "mean"] = "sum",
     ) -> None:
         super().__init__(venv, n_agents)
         #: Factor of the sum of a team's rewards.
+        check_choice("team_return", team_return, ("sum", "mean"))
         self.share_of_sum = 1.0 if team_return == "sum" else 1.0 / self.n_agents
         columns = sorted(_COLUMNS.intersection(info_keywords))
         if columns:
@@ -82,7 +84,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._success_is_told: set[bool] = set()
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
-        self._filename = filename
+        self._filename = None if filename is None else os.fspath(filename)
         self._writer: ResultsWriter | None = None
 
     def reset(self) -> VecEnvObs:

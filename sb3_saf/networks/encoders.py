@@ -83,7 +83,7 @@ def picture_of(space: spaces.Space[Any], asked: bool = False) -> Picture | None:
     layout: Literal["plane", "channels_first", "channels_last"]
     if len(shape) == 2:
         layout, sizes = "plane", (1, *shape)
-    elif len(shape) == 3 and shape[0] == min(shape):
+    elif len(shape) == 3 and shape[0] == min(shape) and not shape[0] == shape[1] < shape[2]:  # a stack of small squares
         layout, sizes = "channels_first", shape
     elif len(shape) == 3:
         layout, sizes = "channels_last", (shape[2], *shape[:2])
@@ -96,7 +96,9 @@ def picture_of(space: spaces.Space[Any], asked: bool = False) -> Picture | None:
     of_shares = bounds == (0, 1) and np.issubdtype(space.dtype, np.floating)
     if (of_bytes or of_shares) and sizes[0] < min(sizes[1:]) and min(sizes[1:]) >= _UNMARKED_PIXELS:
         return Picture(sizes, layout, 255 if of_bytes else 1)
-    return Picture(sizes, layout, 1) if asked and len(shape) == 3 else None
+    is_wide = np.issubdtype(space.dtype, np.integer) and _WIDE < bounds[1] < _UNBOUNDED
+    divisor = int(bounds[1]) if of_bytes or is_wide else 1
+    return Picture(sizes, layout, divisor) if asked and len(shape) == 3 else None
 
 
 def checked_atlas(space: Any) -> npt.NDArray[np.uint8]:
@@ -227,6 +229,11 @@ class PixelInput(nn.Module):
         return self.layout == "codes" and observations.device.type == "cpu" and not th.compiler.is_compiling()
 
 
+def _border(rows: int, columns: int) -> nn.Module:
+    """Return a layer that adds zeros below and to the right of pictures."""
+    return nn.ZeroPad2d((0, columns, 0, rows)) if rows or columns else nn.Identity()
+
+
 class _FlattenPictures(nn.Flatten):
     """Flatten pictures, and keep the gradient in channels-last memory, which makes the previous layer fast."""
 
@@ -251,7 +258,8 @@ class PaperCNN(Encoder):
         super().__init__(observation_space, features_dim)
         self.pixels = PixelInput(observation_space)
         channels, height, width = self.pixels.shape
-        out_height, out_width = (((size - 4) // 2 + 1 - 3) // 2 + 1 for size in (height, width))
+        self.border = _border(-height % 4, -width % 4)  # else strides leave the last rows and columns out
+        out_height, out_width = (((size + -size % 4 - 4) // 2 + 1 - 3) // 2 + 1 for size in (height, width))
         if min(height, width) < PAPER_PIXELS:
             raise ValueError(
                 f"PaperCNN needs pictures of at least 8 x 8 pixels, got {height} x {width}; use "
@@ -268,13 +276,14 @@ class PaperCNN(Encoder):
             Linear(512, features_dim, gain=HIDDEN_GAIN),
         )
         self._places: Places | None = None
-        if self.pixels.layout == "codes" and (tile := self.pixels.atlas.shape[1]) % 2 == 0:
+        is_whole = isinstance(self.border, nn.Identity)
+        if is_whole and self.pixels.layout == "codes" and (tile := self.pixels.atlas.shape[1]) % 2 == 0:
             self._places = places_of_convolution(height // tile, width // tile, tile, kernel=4, stride=2)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, ...) as (K, features_dim)."""
         if self._places is None or not self.pixels.looks_up(observations):
-            return self.net(self.pixels(observations))
+            return self.net(self.border(self.pixels(observations)))
         first = self.net[0]
         assert isinstance(first, nn.Conv2d) and first.bias is not None
         used = used_codes(observations.flatten(1))
@@ -297,17 +306,20 @@ class NatureEncoder(Encoder):
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 64):
         super().__init__(observation_space, features_dim)
         self.pixels = PixelInput(observation_space)
-        _, height, width = self.pixels.shape
+        channels, height, width = self.pixels.shape
         if min(height, width) < NATURE_PIXELS:
             raise ValueError(
                 f"NatureEncoder needs pictures of at least {NATURE_PIXELS} x {NATURE_PIXELS} pixels, got {height} x "
                 f"{width}; use features_extractor_class=sb3_saf.PaperCNN"
             )
-        self.nature = NatureCNN(spaces.Box(0, 255, self.pixels.shape, np.uint8), features_dim)
+        rows, columns = (4 - height) % 8, (4 - width) % 8  # else strides leave the last rows and columns out
+        self.border = _border(rows, columns)
+        padded = (channels, height + rows, width + columns)
+        self.nature = NatureCNN(spaces.Box(0, 255, padded, np.uint8), features_dim)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Encode observations (K, ...) as (K, features_dim)."""
-        return self.nature(self.pixels(observations))
+        return self.nature(self.border(self.pixels(observations)))
 
 
 class LightEncoder(Encoder):

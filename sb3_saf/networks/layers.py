@@ -114,6 +114,21 @@ def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float
     return nn.Sequential(*layers, Linear(sizes[-2], sizes[-1], gain=output_gain))
 
 
+#: Activations that are the same function of every number, which nets may share.
+_ELEMENTWISE: Final = (
+    Tanh,
+    nn.ReLU,
+    nn.ELU,
+    nn.GELU,
+    nn.SiLU,
+    nn.LeakyReLU,
+    nn.Sigmoid,
+    nn.Softplus,
+    nn.Mish,
+    nn.Identity,
+)
+
+
 def side_by_side(groups: Sequence[Sequence[nn.Sequential]], x: th.Tensor) -> list[th.Tensor]:
     """
     Evaluate several MLPs on the same inputs in few large operations: the first layers of all in one product, every
@@ -123,6 +138,8 @@ def side_by_side(groups: Sequence[Sequence[nn.Sequential]], x: th.Tensor) -> lis
     :param x: (K, d)
     :return: for each group of U MLPs, (U, K, P); few outputs are stored as (U, P, K), which is faster for what follows
     """
+    if any(type(layer) not in _ELEMENTWISE for group in groups for layer in [*group[0]][1::2]):
+        return [th.stack([net(x) for net in group]) for group in groups]
     firsts = [cast(nn.Linear, net[0]) for group in groups for net in group]
     wide = nn.functional.linear(x, th.cat([one.weight for one in firsts]), th.cat([one.bias for one in firsts]))
     have_hidden = [len(group[0]) > 1 for group in groups]

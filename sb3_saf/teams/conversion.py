@@ -301,7 +301,8 @@ class AgentConversion:
         """
         own, row_choices = self.action.choices, self.row_action.choices
         if mask is not None and own != row_choices and np.shape(mask) == (sum(row_choices),):
-            return np.asarray(mask, dtype=np.int8)  # that of a row already
+            given, mask = checked_mask(mask, sum(row_choices)), np.ones(sum(own), np.int8)  # that of a row already
+            return given & self.mask(mask)
         array = np.ones(sum(own), np.int8) if mask is None and not self.needs_mask else checked_mask(mask, sum(own))
         if own == row_choices:
             return array

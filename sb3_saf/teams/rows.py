@@ -72,9 +72,9 @@ class AgentSpace(spaces.Discrete):
         self.conversions = None if conversions is None else tuple(conversions)
 
     def __eq__(self, other: object) -> bool:
-        """Compare sizes, and the order of equal names: critics, and actors that read the index, depend on it."""
-        names, others = self.names, getattr(other, "names", None)
-        is_reordered = names is not None and others is not None and names != others and set(names) == set(others)
+        """Compare sizes, and the places of equal names: critics, and actors that read the index, depend on it."""
+        names, others = self.names or (), getattr(other, "names", None) or ()
+        is_reordered = any(names.index(name) != others.index(name) for name in set(names) & set(others))
         return super().__eq__(other) and not is_reordered
 
     def __repr__(self) -> str:

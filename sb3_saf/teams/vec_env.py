@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from numbers import Integral
@@ -216,6 +217,10 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
     :param n_agents: N if known; None reads it from the environment
     :raises ValueError: if N is unknown, contradicts the environment or does not divide B
     """
+    if not isinstance(venv, VecEnv):
+        raise ValueError(
+            f"expected a VecEnv of flattened teams, got {reprlib.repr(venv)}; build it with sb3_saf.make_team_env(...)"
+        )
     stated = find_n_agents(venv)
     if n_agents is not None:
         n_agents = check_count("n_agents", n_agents)
@@ -282,8 +287,10 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
     Check that evaluation does not use the games of training.
 
     :param training: environment of teams; one without an attribute ``seeded_with`` passes
-    :raises ValueError: if both contain a game with the same seed
+    :raises ValueError: if both are the same games, or contain one with the same seed
     """
+    if [*layers(training)][-1] is [*layers(evaluation)][-1]:
+        raise ValueError("expected games of evaluation that are not trained on, got the games of training themselves")
     common = set(game_seeds_of(training) or ()) & set(game_seeds_of(evaluation) or ()) - {None}
     if common:
         raise ValueError(
@@ -341,8 +348,9 @@ class TeamVecEnvWrapper(VecEnvWrapper):
     def __init__(
         self, venv: VecEnv, n_agents: int | None = None, observation_space: spaces.Space[Any] | None = None
     ) -> None:
+        n_agents = require_n_agents(venv, n_agents)
         super().__init__(venv, observation_space=observation_space)
-        self.n_agents = require_n_agents(venv, n_agents)
+        self.n_agents = n_agents
         self.n_games = venv.num_envs // self.n_agents
         self._warned_of_rows: bool = isinstance(venv, TeamVecEnvWrapper) and venv._warned_of_rows
         if is_vecenv_wrapped(venv, VecMonitor):

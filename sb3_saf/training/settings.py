@@ -350,6 +350,11 @@ def _build(
     if own.get("algorithm") == find_algorithm(algo).algorithm.__name__:
         del own["algorithm"]
     env_kwargs = environment.complete(own.get("env_kwargs", {}))
+    if taken := sorted(env_kwargs.keys() & (inspect.signature(make_team_env).parameters.keys() - {"params"})):
+        raise ValueError(
+            f"{taken} of env_kwargs are arguments of make_team_env, so {environment.id} cannot get them; give the game "
+            "other names for them, or a function that makes it with them: --env my_module:make"
+        )
     wrapping = {key: own[key] for key in WRAPPER_KEYS if key in own}
     if wrapping.get("normalize", False) is not False and issubclass(spec.algorithm, OffPolicyAlgorithm):
         raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {algo}")
@@ -542,7 +547,8 @@ def ppo_settings(
         n_minibatches = source["n_minibatches"]
         n_steps = max(source["n_steps"], -(-rollout // (n_games * n_minibatches)) * n_minibatches)
         teams = int(overrides.get("n_steps", n_steps)) * n_games
-        found |= {"n_steps": n_steps, "batch_size": teams // (1 if teams % n_minibatches else n_minibatches) * n_agents}
+        rows = teams // (1 if teams % n_minibatches else n_minibatches) * n_agents
+        found |= {"n_steps": n_steps, "batch_size": max(2, rows)}
     policy_kwargs = source.get("policy_kwargs", {}) | spec.policy_kwargs
     if memory is not None:
         policy_kwargs["memory"] = memory
