@@ -161,6 +161,8 @@ class TestAttention:
         found = attention_of(np.array([[[0.5, 0.5]], [[0.0, 0.0]]]))
         assert found.mean.tolist() == [[0.5, 0.5]]
         assert found.entropy == pytest.approx(1)
+        found = attention_of(np.array([[[0.5, 0.5, 0.0]], [[1 / 3, 1 / 3, 1 / 3]]]))  # an agent is out, then in
+        assert found.entropy == pytest.approx(1)
 
     def test_a_single_source_has_no_entropy(self) -> None:
         assert attention_of(np.ones((2, 3, 1)))[1:] == (None, None)

@@ -165,8 +165,8 @@ class Attention(NamedTuple):
     Attention of queries over sources, over many teams.
 
     :param mean: (Q, S) mean weights; rows sum to 1
-    :param entropy: mean entropy of one query's weights, divided by log S: 0 if one source has all weight, 1 for uniform
-        weights; None if there is only one source
+    :param entropy: mean entropy of one query's weights, divided by the log of its number of sources (agents that are
+        out are none): 0 if one source has all weight, 1 for uniform weights; None if there is only one source
     :param entropy_of_mean: entropy of a query's mean weights, divided by log S, mean over queries; None for a single
         source. Higher than ``entropy`` if the attended source changes
     """
@@ -184,9 +184,9 @@ def attention_of(weights: Floats) -> Attention:
         mean = weights.sum(axis=0, dtype=np.float64) / has_source.sum(axis=0)[:, np.newaxis]
     if n_sources == 1 or not has_source.any():
         return Attention(mean, None, None)
-    scale = math.log(n_sources)
-    of_mean = float(entropy(mean[has_source.any(axis=0)]).mean()) / scale
-    return Attention(mean, float(entropy(weights)[has_source].mean()) / scale, of_mean)
+    of_mean = float(entropy(mean[has_source.any(axis=0)]).mean()) / math.log(n_sources)
+    n_own = np.maximum(2, (weights > 0).sum(axis=2))  # fewer where agents are out
+    return Attention(mean, float((entropy(weights) / np.log(n_own))[has_source].mean()), of_mean)
 
 
 def write_attention(recording: EpisodeRecording) -> Attention | None:
