@@ -63,6 +63,8 @@ MEMORY: Final = "memory"
 LENGTH: Final = "length10"
 #: Every actor with every critic: names begin so.
 FACTORIAL: Final = "factorial"
+#: Zones as pixels, of the grid's length.
+PIXELS: Final = ("pixels", "pixels_pool4")
 #: SAF and MAPPO with zones as pixels, of seeds that were trained after the test of their difference had been declared.
 FRESH: Final = "fresh_pixels"
 #: Teams of ``benchmarks.scripted``, in words.
@@ -462,7 +464,7 @@ def pages() -> dict[Path, str]:
     tests = frames.tests
     unseen = other_levels()
     parts = _in_order(read(PARTS).tests.query("game_steps > 0"))
-    pixels = pd.concat([read(name).tests for name in others if name.startswith("pixels")])
+    pixels = pd.concat([read(name).tests for name in PIXELS])
     blocks = {
         "answer": answer(frames),
         "methods": methods_table(tests, unseen),
