@@ -194,8 +194,11 @@ def test_battles_of_smax() -> None:
     assert "active" not in observations
     n_dead, won = 0, []
     for _ in range(120):  # allies approach the enemy, and all shoot at the same one
-        shots = observations["action_mask"][:, 5:]
-        observations, rewards, dones, infos = env.step(np.where(shots.any(axis=1), 5 + shots.argmax(axis=1), 1))
+        legal = observations["action_mask"]
+        ahead = np.where(legal[:, 1], 1, 4)  # the dead stand still
+        observations, rewards, dones, infos = env.step(
+            np.where(legal[:, 5:].any(axis=1), 5 + legal[:, 5:].argmax(axis=1), ahead)
+        )
         game = jax.tree.map(lambda leaf: leaf[1], venv.batch.games)
         alive = np.asarray(game.state.state.unit_alive[:3])
         assert rewards[3] == rewards[4] == rewards[5]
