@@ -18,7 +18,7 @@ from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, e
 from sb3_saf.experiments.report import Content, known, losses
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
-from sb3_saf.experiments.tables import Frames, beside, complete, marl_eval, read_results
+from sb3_saf.experiments.tables import Frames, beside, complete, marl_eval, read_results, seconds_at
 from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import finish_run
@@ -126,6 +126,15 @@ def test_results_as_tables(folder: Path) -> None:
     spent = curves[curves["game_steps"] == 80].set_index(["method", "task", "level", "seed"])["processor_seconds"]
     trained = tests[tests["game_steps"] > 0].groupby(["method", "task", "train_level", "seed"])["processor_seconds"]
     assert spent.to_dict() == pytest.approx(trained.first().to_dict())
+
+
+def test_evaluations_have_times_of_their_own() -> None:
+    """Games end in other steps, and the last rollout goes beyond the steps that were asked for."""
+    steps = pd.Series([20, 80, 102])
+    training = pd.DataFrame({"game_steps": [40, 90, 96], "processor_seconds": [1.0, 2.0, 2.2]})
+    assert seconds_at(steps, training, 2.5).tolist() == pytest.approx([0.5, 1.8, 2.5])
+    training["game_steps"] = [40, 90, 104]
+    assert seconds_at(steps, training, 2.5).tolist() == pytest.approx([0.5, 1.8, 2 + 0.2 * 12 / 14])
 
 
 def test_results_that_are_not_there(tmp_path: Path) -> None:

@@ -290,15 +290,24 @@ def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
             names = {"method": cell.method, "task": cell.task, "level": cell.level.slug, **cell.level.env_kwargs}
             evaluations, training = pd.read_csv(run.folder / EVALUATIONS), read_curve(run.folder)
             steps = evaluations["game_steps"].astype(float)
-            # Games end between evaluations: before the first of them and after the last the run's ends are known.
-            known = [0, *training["game_steps"], run.settings.game_steps]
-            spent = [0, *training["processor_seconds"], run.finished()["processor_seconds"]]
-            seconds = np.interp(steps, known, spent)
+            seconds = seconds_at(steps, training, run.finished()["processor_seconds"])
             curve = pd.DataFrame(
                 {"game_steps": steps, "processor_seconds": seconds, "score": evaluations["return_mean"]}
             )
             curves.append(curve.assign(**names, seed=cell.seed))
     return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+
+
+def seconds_at(steps: pd.Series, training: pd.DataFrame, total: float) -> Floats:
+    """
+    Return the processor seconds until evaluations, by interpolation between episodes that ended.
+
+    :param steps: game steps of the evaluations; a last rollout may go beyond those that were asked for
+    :param training: game steps and processor seconds at ends of episodes
+    :param total: processor seconds of the whole training
+    """
+    end = max(steps.max(), training["game_steps"].max())
+    return np.interp(steps, [0, *training["game_steps"], end], [0, *training["processor_seconds"], total])
 
 
 def marl_eval(frames: Frames, environment: str) -> dict[str, Any]:
