@@ -422,7 +422,7 @@ def evaluate_team(
             if n_agents > 1 and "agents" not in episode:
                 raise ValueError(
                     "expected episodes of TeamMonitor in infos, got those of a VecMonitor around it, which counts each "
-                    "agent for a game: leave it away, TeamMonitor counts episodes and writes monitor.csv as it does"
+                    "agent for a game: leave it out, TeamMonitor counts episodes and writes monitor.csv as it does"
                 )
             returns.append(float(episode["r"]))
             lengths.append(int(episode["l"]))

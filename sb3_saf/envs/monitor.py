@@ -64,8 +64,8 @@ class TeamMonitor(TeamVecEnvWrapper):
         team_return: Literal["sum", "mean"] = "sum",
     ) -> None:
         super().__init__(venv, n_agents)
-        #: Factor of the sum of a team's rewards.
         check_choice("team_return", team_return, ("sum", "mean"))
+        #: Factor of the sum of a team's rewards.
         self.share_of_sum = 1.0 if team_return == "sum" else 1.0 / self.n_agents
         columns = sorted(_COLUMNS.intersection(info_keywords))
         if columns:
