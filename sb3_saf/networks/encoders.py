@@ -248,7 +248,8 @@ class PaperCNN(Encoder):
     """
     The paper's encoder: convolutions 4x4/2 -> 32 and 3x3/2 -> 64, linear 512, linear ``features_dim``, ReLU between.
 
-    A 28 x 28 x 3 view gives 2,304 numbers after the convolutions, and the encoder has 1,233,056 parameters.
+    A 28 x 28 x 3 view gives 2,304 numbers after the convolutions, and the encoder has 1,233,056 parameters. Sides that
+    are no multiples of 4 get zeros at their ends, else the strides would leave pixels out.
 
     :param observation_space: pictures (any layout) or tile codes
     :param features_dim: size of the features
@@ -297,7 +298,8 @@ class NatureEncoder(Encoder):
     ``features_dim``, ReLU after each).
 
     Its strides are larger than the paper's and no wide layer follows: at 84 x 84 x 3 it has 0.3 million weights instead
-    of ``PaperCNN``'s 13 million, and is six times faster; at 280 x 480 it has 7 million instead of 269 million.
+    of ``PaperCNN``'s 13 million, and is six times faster; at 280 x 480 it has 8 million instead of 269 million. Sides
+    other than 36, 44, 52 ... get zeros at their ends, else the strides would leave pixels out.
 
     :param observation_space: pictures (any layout) or tile codes, 36 x 36 pixels or more
     :param features_dim: size of the features

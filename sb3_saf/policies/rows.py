@@ -124,7 +124,8 @@ class TeamRowsPolicy(BasePolicy):
             step before, ``{agent: state}``. None where episodes begin; agents that it lacks begin
         :param episode_start: as in SB3
         :param deterministic: as in SB3
-        :param kwargs: ``action_masks`` of MaskablePPO, for rows or in the form of the observation
+        :param kwargs: ``action_masks`` of MaskablePPO, for rows or in the form of the observation, with None for an
+            agent that may do everything
         :return: actions and the next state; ``{agent: action}`` for observations by agent
         """
         given = self.given_by_game(observation, kwargs.get("action_masks"))
