@@ -280,9 +280,11 @@ class GameBatch:
         :param which: (E,) the games to reset; all by default
         :param seeds: (E,) a seed starts a game's randomness and history anew, None continues it
         """
-        chosen = np.ones(self.n_games, dtype=bool) if which is None else np.asarray(which, dtype=bool)
-        if chosen.shape != (self.n_games,):
-            raise ValueError(f"which must have shape ({self.n_games},), one per game, got {chosen.shape}")
+        chosen = np.ones(self.n_games, dtype=bool) if which is None else np.asarray(which)
+        if chosen.dtype != np.bool_ or chosen.shape != (self.n_games,):
+            raise ValueError(f"which must be {self.n_games} booleans, one per game, got {which!r}")
+        if seeds is not None and len(seeds) != self.n_games:
+            raise ValueError(f"seeds must be {self.n_games}, one per game, got {len(seeds)}")
         for e in np.flatnonzero(chosen).tolist():
             self._seed(e, None if seeds is None else seeds[e])
         self._buffers.fresh[...] = chosen

@@ -158,7 +158,8 @@ class HECOGridParams:
     @property
     def n_clutter(self) -> int:
         """Wall cells inside the outer wall."""
-        return int(self.clutter_density * self.n_interior_cells)
+        inside = self.grid_size - 2
+        return int(self.clutter_density * inside * inside)  # in the rule book's order, which decides the rounding
 
     @property
     def view_pixels(self) -> int:

@@ -67,6 +67,11 @@ def test_levels_have_what_the_parameters_say(task: str) -> None:
         assert not state["agent_has_key"].any()
 
 
+@pytest.mark.parametrize(("density", "size", "walls"), [(0.12, 17, 26), (0.29, 12, 29), (0.1, 30, 78)])
+def test_clutter_is_rounded_as_in_the_rule_book(density: float, size: int, walls: int) -> None:
+    assert HECOGridParams(clutter_density=density, grid_size=size).n_clutter == walls
+
+
 def test_levels_are_uniform() -> None:
     """Treasures are uniform over cells, and agents over directions: chi-square within its 99.9 % bound."""
     params = HECOGridParams(n_agents=3, grid_size=7, n_treasures=5, clutter_density=0.2)
@@ -128,7 +133,9 @@ def wrong_calls(batch: GameBatch) -> dict[str, tuple[Callable[[], object], str]]
         "flat last": (lambda: batch.advance(actions, last=read_only.reshape(-1)), "last .*got uint8"),
         "fractions": (lambda: batch.step(actions + 2.7), f"{integers} float64"),
         "flat actions": (lambda: batch.step(actions.reshape(-1)), r"actions must have shape \(4, 5\), .* got \(20,\)"),
-        "other games": (lambda: batch.reset(np.ones(3, dtype=bool)), r"which must have shape \(4,\), one per game"),
+        "other games": (lambda: batch.reset(np.ones(3, dtype=bool)), "which must be 4 booleans, one per game"),
+        "indices": (lambda: batch.reset([0, 1, 0, 1]), r"which must be 4 booleans, .* got \[0, 1, 0, 1\]"),  # type: ignore[arg-type]
+        "other seeds": (lambda: batch.reset(seeds=[1, 2, 3]), "seeds must be 4, one per game, got 3"),
         **{
             f"{value} as {dtype}": (
                 partial(batch.step, (actions + value).astype(dtype)),

@@ -170,6 +170,9 @@ def test_an_experiment_of_ones_own() -> None:
         own_experiment("mine", ["a.b"], {"a": [1], "b": [2]})
     with pytest.raises(ValueError, match="expects numbers or words, such as a:"):
         own_experiment("mine", ["a.b"], {"a": ["../x"]})
+    for alike in ([1, True], [2, "2"]):
+        with pytest.raises(ValueError, match="--vary a expects different values, got"):
+            own_experiment("mine", ["a.b"], {"a": alike})
     for name in ("joint", "../x", ""):
         with pytest.raises(ValueError, match="needs a name of letters"):
             own_experiment(name, ["a.b"], {})

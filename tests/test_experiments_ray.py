@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -20,7 +21,7 @@ import pytest
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, run_job
 from sb3_saf.experiments.definitions import Cell, RunConfig, Selection, find_experiment
-from sb3_saf.experiments.engines import RayEngine, _run_on_ray, require_ray
+from sb3_saf.experiments.engines import RayEngine, _run_on_ray, inputs_of, require_ray
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
 from sb3_saf.teams.files import read_json
@@ -198,9 +199,9 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any,
     assert_same_weights(whole / "result" / "model.zip", killed / "result" / "model.zip")
 
 
-@pytest.mark.parametrize("is_shared", [True, False])
-def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, tmp_path: Path) -> None:
-    """On such a node, killed cells resume; from other nodes, results are sent."""
+@pytest.mark.parametrize(("is_shared", "is_trained"), [(True, False), (False, False), (False, True)])
+def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, is_trained: bool, tmp_path: Path) -> None:
+    """On such a node, killed cells resume; to and from other nodes, trained models and results are sent."""
     experiment = find_experiment("joint")
     (level, *_) = experiment.tests()
     job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}, 32, 40, 2))
@@ -209,14 +210,15 @@ def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, tmp_path: Path
         job.write(tmp_path / name)
     run_job(tmp_path / "here")
     folder = tmp_path / "there"
-    archive = _run_on_ray(
-        str(folder if is_shared else tmp_path / "x"), {"job.json": (folder / "job.json").read_bytes()}
-    )
+    for model in (tmp_path / "here" / "result").glob("*.zip") if is_trained else ():
+        shutil.copy(model, folder)
+    archive = _run_on_ray(str(folder if is_shared else tmp_path / "x"), inputs_of(folder))
     assert (archive is None) == is_shared
     if archive is not None:
         zipfile.ZipFile(io.BytesIO(archive)).extractall(folder / "result")
     ours, theirs = ((tmp_path / name / "result" / "tests/c2-h2.json").read_text() for name in ("here", "there"))
     assert ours.partition('"wall')[0] == theirs.partition('"wall')[0]
+    assert (folder / "result" / "run.json").exists() != is_trained
 
 
 def test_ray_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

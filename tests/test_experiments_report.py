@@ -92,7 +92,7 @@ def test_numbers_of_the_page_are_those_of_the_table(folder: Path, page: str) -> 
     assert [line.split(" | ")[-1] for line in rows] == ["fewer than 3 pairs |"] * (2 * len(LEVELS))
 
 
-def test_losses_are_shares_of_the_first_level(page: str) -> None:
+def test_losses_are_shares_of_the_easiest_level(page: str) -> None:
     rows = [
         (method, seed, c, 4.0 - c if method == "saf" else 0.0)
         for method in ("saf", "ippo")
@@ -110,6 +110,10 @@ def test_losses_are_shares_of_the_first_level(page: str) -> None:
     assert text.splitlines()[-2:] == [f"| TeamSupport | SAF | {cells} |", "| TeamSupport | IPPO, shared | – | – |"]
     assert "## Loss by coordination" in page
     assert losses(table, EXPERIMENTS["ood-coordination"].views[0]) == ""
+    view = EXPERIMENTS["coordination"].views[0]
+    assert losses(table, view._replace(levels=view.levels[::-1])) == text
+    of_agents = own_experiment("mine", ["TeamSupport-v0"], {"n_agents": [1, 2]}).views[0]
+    assert losses(table.assign(level=[level.replace("c", "n")[:2] for level in levels]), of_agents) == ""
 
 
 def test_results_as_tables(folder: Path) -> None:

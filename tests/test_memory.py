@@ -67,6 +67,25 @@ def weights(model: Any) -> dict[str, th.Tensor]:
 # --- sequences --------------------------------------------------------------------------------------------------------
 
 
+def test_advantages_can_be_computed_again() -> None:
+    """As by a callback that changes rewards at the end of a rollout; until then nobody reads values."""
+    model = collected(make_model())
+    buffer, model.n_epochs = model.rollout_buffer, 1
+    known, memories = buffer.advantages.copy(), buffer.memories
+    buffer.rewards += 1
+    buffer.compute_returns_and_advantage(th.zeros(buffer.n_envs), np.ones(buffer.n_envs))
+    assert buffer.memories is memories
+    assert (buffer.advantages > known).all()
+    PPO.train(model)
+    buffer.reset()
+    model.policy.set_training_mode(False)
+    with th.no_grad():
+        actions, values, log_probs = model.policy(obs_as_tensor(model._last_obs, model.device))
+    rows = model._last_obs, actions.numpy(), np.zeros(buffer.n_envs), np.zeros(buffer.n_envs)
+    buffer.add(*rows, values, log_probs)
+    assert np.isnan(buffer.values[0]).all()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("game", ["dying", "staggered"])

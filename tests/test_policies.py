@@ -18,6 +18,7 @@ from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy, TeamRolloutBuffer
@@ -519,6 +520,31 @@ def test_the_ratio_is_one_before_the_weights_change(action_space: spaces.Space[A
     ratios = first_ratios(24, venv=ToyTeams(action_space=action_space))
     assert len(ratios) == 120
     assert (ratios - 1).abs().max() < 1e-6
+
+
+def test_rounded_actions_have_other_likelihoods() -> None:
+    """SB3's buffer stores actions as the space has them; ours as they were drawn."""
+    space = spaces.Box(-5, 5, (2,), np.int32)
+    with pytest.raises(
+        ValueError, match=r"rounds drawn actions to int32.*rollout_buffer_class=sb3_saf\.TeamRolloutBuffer"
+    ):
+        make_model(venv=ToyTeams(action_space=space))
+    ratios = first_ratios(24, venv=ToyTeams(action_space=space), rollout_buffer_class=TeamRolloutBuffer)
+    assert (ratios - 1).abs().max() < 1e-6
+
+
+def test_values_of_observations_that_were_normalised_above_the_teams() -> None:
+    """Rollout and minibatches read the same entries, whether whole teams or shuffled rows of SB3's buffer."""
+    env = VecNormalize(ToyTeams(spaces.Box(3.0, 9.0, (5,))), norm_obs_keys=["obs", "team"], norm_reward=False)
+    model = make_model("MAPPOPolicy", env, learning_rate=0.0)
+    model.learn(120)
+    for samples in model.rollout_buffer.get(24):
+        values = model.policy.predict_values(samples.observations)
+        th.testing.assert_close(values.flatten(), samples.old_values, rtol=0, atol=1e-5)
+    rows = {key: value[[0, 4, 8]] for key, value in team_rows(VECTOR).items()}  # of three games, in the agents' order
+    policy = make_policy(MAPPOPolicy)
+    with th.no_grad():
+        th.testing.assert_close(th.Tensor(policy(rows)[1]), policy.predict_values(rows))
 
 
 def test_with_gumbel_it_is_not() -> None:

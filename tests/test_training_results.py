@@ -24,7 +24,7 @@ from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
-from sb3_saf.training.folders import Run, training_curve, write_run
+from sb3_saf.training.folders import Run, finish_run, training_curve, write_run
 from sb3_saf.training.plot import describe, find_runs, setting_names
 from sb3_saf.training.settings import load_settings
 from tests.test_training_commands import failed
@@ -231,6 +231,15 @@ def fake_run(folder: Path, number: int, seed: int = 0, options: dict[str, Any] |
     """Write a run's settings, as training does."""
     settings = load_settings("saf", ENV, "smoke", overrides=overrides)
     write_run(folder / "saf" / f"{ENV}_{number}", settings.as_dict(), seed, "", options)
+
+
+def test_a_folder_that_is_used_again_has_nothing_of_the_run_before(tmp_path: Path) -> None:
+    fake_run(tmp_path, 1)
+    (folder,) = (tmp_path / "saf").iterdir()
+    (folder / "curve.csv").write_text("game_steps,processor_seconds,score,episodes\n40,1,2,1\n")
+    finish_run(folder, wall_seconds=1.0)
+    fake_run(tmp_path, 1, seed=1)  # stopped before its first game was over
+    assert [path.name for path in folder.iterdir()] == ["run.json"]
 
 
 def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:

@@ -6,10 +6,9 @@ import numpy as np
 
 from hecogrid_envs.constants import Terrain
 from hecogrid_envs.core.jit import hot, inlined, kernel
-from hecogrid_envs.core.occupancy import arrive, plane_offset, redraw_cell, set_wall_bits
+from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.types import Games, World, whole
-from hecogrid_envs.tiles import FIRST_TERRAIN
 
 _EMPTY = int(Terrain.EMPTY)
 _WALL = int(Terrain.WALL)
@@ -97,40 +96,13 @@ def redraw(games: Games, world: World, e: int) -> None:
     bits = e * 4 * world.bits_bytes
     for i in range(4 * world.bits_bytes):
         games.wall_bits[np.uint64(bits + i)] = world.blank_bits[np.uint64(i)]
-    _draw_terrain(games, world, e)
     for y in range(1, world.width - 1):
         for x in range(1, world.width - 1):
-            ground = games.terrain[e, np.uint64(y * world.width + x)]
-            if ground == _WALL:
+            if games.terrain[e, np.uint64(y * world.width + x)] == _WALL:
                 set_wall_bits(games, world, e, x, y)
-            elif ground == _KEY:
-                redraw_cell(games, world, e, x, y)
+            redraw_cell(games, world, e, x, y)
     for agent in range(world.n_agents):
         games.sight_known[e, agent] = 0
-        redraw_cell(games, world, e, games.x[e, agent], games.y[e, agent])
-
-
-@inlined
-def _draw_terrain(games: Games, world: World, e: int) -> None:
-    """
-    Write every cell inside the outer wall into the four planes, as if it looked the same from all directions.
-
-    Equivalent to :func:`redraw_cell` for each cell, without its unpredictable branch per cell.
-    """
-    stride = world.stride
-    end = stride * stride - 1
-    plane = e * 4 * world.plane_bytes
-    for y in range(1, world.width - 1):
-        cell = y * world.width + 1
-        # As in plane_offset: towards larger x, by one byte in one orientation, by whole rows in the other.
-        along, across = plane_offset(world, 3, 1, y), plane_offset(world, 2, 1, y)
-        for _ in range(world.width - 2):
-            code = FIRST_TERRAIN + games.terrain[np.uint64(e), np.uint64(cell)]
-            games.planes[np.uint64(plane + end - across)] = code
-            games.planes[np.uint64(plane + world.plane_bytes + end - along)] = code
-            games.planes[np.uint64(plane + 2 * world.plane_bytes + across)] = code
-            games.planes[np.uint64(plane + 3 * world.plane_bytes + along)] = code
-            cell, along, across = cell + 1, along + 1, across + stride
 
 
 @inlined

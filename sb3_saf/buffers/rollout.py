@@ -423,7 +423,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             self.starts[self.pos] = np.reshape(obs[EPISODE_START_KEY], (-1, 1))
         if isinstance(value, LaterValues):
             self._later.append((self.pos, value))
-            value = log_prob  # placeholder: compute_returns_and_advantage overwrites it
+            value = th.full_like(log_prob, th.nan)  # until compute_returns_and_advantage
         super().add(obs, action, reward, episode_start, value, log_prob)
 
     def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
@@ -473,10 +473,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             positions, steps = zip(*self._later[start : start + at_once], strict=True)
             for position, values in zip(positions, compute_together(steps), strict=True):
                 self.values[position] = values.reshape(-1).cpu().numpy()
-        cuts = [value.step.memory for _, value in self._later[:: self.sequence_length]]
-        memories = [memory for memory in cuts if memory is not None]
-        self.memories = th.stack(memories) if memories else None
-        self._later.clear()
+        if self._later:  # not in a second call, after a callback has changed rewards
+            cuts = [value.step.memory for _, value in self._later[:: self.sequence_length]]
+            memories = [memory for memory in cuts if memory is not None]
+            self.memories = th.stack(memories) if memories else None
+            self._later.clear()
         counted = np.ones((self.buffer_size, self.n_envs), dtype=np.bool_)
         if self.active is not None:
             counted = self.active.reshape(self.buffer_size, self.n_envs) != 0

@@ -225,7 +225,9 @@ def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[A
                 raise ValueError(
                     f"--vary {parameter} expects numbers or words, such as {parameter}:[1,2], got {value!r}"
                 )
-        view = View(parameter, tuple(Level(((parameter, value),)) for value in dict.fromkeys(values)))
+        view = View(parameter, tuple(Level(((parameter, value),)) for value in values))
+        if len(set(values)) < len(values) or len({level.slug for level in view.levels}) < len(values):
+            raise ValueError(f"--vary {parameter} expects different values, got {', '.join(map(repr, values))}")
     return Experiment(name, f"methods on {', '.join(envs)}", tuple(envs), _METHODS, (view,))
 
 

@@ -176,8 +176,7 @@ class RayEngine(Engine):
 
     def submit(self, folder: Path) -> Future[None]:
         """Start a job; see :meth:`Engine.submit`."""
-        inputs = {name: (folder / name).read_bytes() for name in ("job.json", "model.zip") if (folder / name).exists()}
-        reference = self._task.remote(str(folder.resolve()), inputs)
+        reference = self._task.remote(str(folder.resolve()), inputs_of(folder))
         self._references.append(reference)
         done: Future[None] = Future()
         reference.future().add_done_callback(lambda answer: self._settle(done, answer, folder))
@@ -203,6 +202,11 @@ class RayEngine(Engine):
             self._ray.cancel(reference, force=True)
         if self._is_ours:
             self._ray.shutdown()
+
+
+def inputs_of(folder: Path) -> dict[str, bytes]:
+    """Return the files that a node needs for a job: the job, and the models of a cell that only is to be tested."""
+    return {path.name: path.read_bytes() for path in (folder / "job.json", *folder.glob("*.zip"))}
 
 
 def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:

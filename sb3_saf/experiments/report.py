@@ -19,7 +19,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_saf.experiments.definitions import (
+    COORDINATION,
     EXPERIMENTS,
+    HETEROGENEITY,
     METHODS,
     PROGRAM,
     RANDOM,
@@ -229,7 +231,7 @@ def page(content: Content) -> str:
         _pictures(content, "levels-", "differences-", "aggregates"),
         *(means(table, view) for view in views),
         known(content),
-        *(losses(table, view) for view in views if table["max_return"].notna().all()),  # levels of HECOGrid get harder
+        *(losses(table, view) for view in views if table["max_return"].notna().all()),
         aggregates(content.experiment, table),
         *(_comparisons(table, view) for view in views),
         _pictures(content, "curve-"),
@@ -349,11 +351,13 @@ def known(content: Content) -> str:
 
 
 def losses(table: pd.DataFrame, view: View) -> str:
-    """Return the loss at harder levels: the lost fraction of the first level's return, paired by seed."""
+    """Return the loss at harder levels: the lost fraction of the easiest level's return, paired by seed."""
+    if view.train is not None or view.parameter not in (COORDINATION, HETEROGENEITY):
+        return ""
     rows = of_view(table, view)
-    first, *harder = view.levels
+    first, *harder = sorted(view.levels, key=view.position)
     harder = [level for level in harder if level.slug in set(rows["level"])]
-    if view.train is not None or not harder:
+    if not harder:
         return ""
     body = []
     for task, of_task in rows.groupby("task", sort=False):

@@ -263,49 +263,20 @@ def _bytes_of_rows(x: th.Tensor) -> th.Tensor:
 
 @cached()
 def _hash_row(words: npt.NDArray[np.uint64], row: int) -> np.uint64:
-    """Multiply and fold, in four independent lanes so that the multiplications overlap."""
-    multiplier, shift = np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
-    a, b, c, d = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
-    width = words.shape[1]
-    i = 0
-    while i + 4 <= width:
-        a = (a ^ words[row, i]) * multiplier
-        b = (b ^ words[row, i + 1]) * multiplier
-        c = (c ^ words[row, i + 2]) * multiplier
-        d = (d ^ words[row, i + 3]) * multiplier
-        # Products carry upwards only: fold the high half down before adding the next word.
-        a ^= a >> shift
-        b ^= b >> shift
-        c ^= c >> shift
-        d ^= d >> shift
-        i += 4
-    while i < width:
-        a = (a ^ words[row, i]) * multiplier
-        a ^= a >> shift
-        i += 1
-    for lane in (b, c, d):
-        a = (a ^ lane) * multiplier
-        a ^= a >> shift
-    return a
+    """Multiply and fold: products carry upwards only, so the high half is folded down before the next word."""
+    code, multiplier, shift = np.uint64(1), np.uint64(0x9E3779B97F4A7C15), np.uint64(32)
+    for i in range(words.shape[1]):
+        code = (code ^ words[row, i]) * multiplier
+        code ^= code >> shift
+    return code
 
 
 @cached()
 def _equal_rows(words: npt.NDArray[np.uint64], row: int, other: int) -> bool:
-    width = words.shape[1]
     i = 0
-    # Eight words per branch, so that the inner loop is vectorised.
-    while i + 8 <= width:
-        difference = np.uint64(0)
-        for j in range(i, i + 8):
-            difference |= words[row, j] ^ words[other, j]
-        if difference != np.uint64(0):
-            return False
-        i += 8
-    while i < width:
-        if words[row, i] != words[other, i]:
-            return False
+    while i < words.shape[1] and words[row, i] == words[other, i]:
         i += 1
-    return True
+    return i == words.shape[1]
 
 
 @cached()

@@ -15,6 +15,7 @@ from functools import partial
 from inspect import signature
 from typing import Any, ClassVar, Final, Literal, NoReturn
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
@@ -128,7 +129,14 @@ class TeamPolicy(RememberingPolicy):
                 "team policies share the features extractor between actor and critic: leave "
                 "share_features_extractor=True"
             )
-        if use_sde is not None and self.takes_team_buffer and not TeamRolloutBuffer.waits_for(observation_space):
+        has_other_buffer = use_sde is not None and self.takes_team_buffer
+        if has_other_buffer and not TeamRolloutBuffer.waits_for(observation_space):
+            if isinstance(action_space, spaces.Box) and not np.can_cast(np.float32, action_space.dtype):
+                raise ValueError(
+                    f"SB3's own rollout buffer rounds drawn actions to {action_space.dtype}, the numbers of "
+                    f"{action_space}, and learns from likelihoods of others than were drawn: train with "
+                    "rollout_buffer_class=sb3_saf.TeamRolloutBuffer, which keeps them"
+                )
             warnings.warn(
                 f"{type(self).__name__} is trained on minibatches of SB3's own rollout buffer, which stores each "
                 "observation once more for every agent and splits teams: slower, with the same result. Train with "

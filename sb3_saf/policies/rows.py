@@ -258,8 +258,8 @@ class TeamRowsPolicy(BasePolicy):
         Whole teams (minibatches of TeamRolloutBuffer, rows of a step) are used directly. In SB3's shuffled minibatches,
         teams are found by their joint observation.
 
-        :param of_step: whether rows in the order of whole teams are those of a step of the environment, which are whole
-            teams by construction; otherwise, their joint observations are compared
+        :param of_step: whether rows in the order of whole teams are those of a step of the environment, where one joint
+            observation of each team is compared with its rows; otherwise, all of them
         """
         if isinstance(obs, TeamMinibatch):
             observations, rows, active, _ = obs.teams
@@ -283,8 +283,8 @@ class TeamRowsPolicy(BasePolicy):
         in_order = th.arange(n_agents, device=agent.device).expand(n_teams, -1)
         if not th.equal(agent.view(n_teams, n_agents), in_order):
             return False
-        if of_step:
-            return True
+        if of_step:  # one row of each team has all of it: wrappers may have changed own observations since
+            return th.equal(own.view(n_teams, n_agents, *shape), team[::n_agents])
         active = self._active(obs)
         if active is not None:
             by_team = active.view(n_teams, n_agents, n_agents)
