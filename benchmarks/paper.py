@@ -30,9 +30,9 @@ from sb3_saf.experiments.tables import (
     holm,
     keys_of,
     marl_eval,
-    pooled,
+    mean_difference,
     read_results,
-    shares,
+    variance_of_tests,
 )
 from sb3_saf.teams.files import write_text
 from sb3_saf.training.figures import draw_curves, draw_differences
@@ -153,6 +153,39 @@ def claims(tests: pd.DataFrame, unseen: pd.DataFrame, pixels: pd.DataFrame) -> l
         Claim("the knowledge source helps", ("saf", "saf-no-ks"), hidden, pixels),
         Claim("high heterogeneity favours SAF, zones as pixels", ("saf", "mappo"), anew, read(FRESH).tests),
     ]
+
+
+def shares(table: pd.DataFrame, first: str, second: str) -> pd.DataFrame:
+    """
+    Return the paired differences of two methods in percent of the largest return.
+
+    :param table: table of tests
+    :return: columns ``setting``, ``seed``, ``difference`` and ``variance`` (of the tests), one row per pair
+    """
+    ours, theirs = (table[table["method"] == method] for method in (first, second))
+    pairs = ours.merge(theirs, on=["train_level", "task", "level", "seed"], suffixes=("", "_second"))
+    scale = 100 / pd.to_numeric(pairs["max_return"]).to_numpy(dtype=np.float64)
+    difference = (pairs["return_mean"] - pairs["return_mean_second"]).to_numpy(dtype=np.float64)
+    setting = pairs["task"] + " " + pairs["train_level"] + " " + pairs["level"]
+    variance = variance_of_tests(pairs) * scale**2
+    return pd.DataFrame(
+        {"setting": setting, "seed": pairs["seed"], "difference": difference * scale, "variance": variance}
+    )
+
+
+def pooled(pairs: pd.DataFrame) -> Difference | None:
+    """
+    Test the mean difference over settings: over those of their means if there are three or more, else over seeds.
+
+    :param pairs: from :func:`shares`
+    :return: in percent of the largest return; None without pairs
+    """
+    if pairs.empty:
+        return None
+    by = "setting" if pairs["setting"].nunique() >= FEWEST_SEEDS else "seed"
+    groups = pairs.groupby(by)
+    noise = float(np.sqrt((groups["variance"].mean() / groups.size()).mean()))
+    return mean_difference(groups["difference"].mean().to_numpy(), noise, 100 * MARGIN)
 
 
 def by_game(tests: pd.DataFrame, first: str, second: str) -> pd.DataFrame:

@@ -185,17 +185,6 @@ class TileSpace(spaces.Box):
     def __eq__(self, other: Any) -> bool:
         return isinstance(other, TileSpace) and super().__eq__(other) and np.array_equal(self.atlas, other.atlas)
 
-    def pixels(self, codes: npt.NDArray[np.uint8]) -> Image:
-        """
-        Draw views.
-
-        :param codes: (..., V, V)
-        :return: (..., V t, V t, 3), exactly the ``"rgb"`` observation of the same views
-        """
-        size, t = codes.shape[-1], self.atlas.shape[1]
-        tiles = np.moveaxis(self.atlas[codes], -4, -3)
-        return tiles.reshape(*codes.shape[:-2], size * t, size * t, 3)
-
 
 def observation_space(task: TaskName, params: HECOGridParams) -> spaces.Box:
     """

@@ -313,11 +313,11 @@ class FiniteCallback(BaseCallback):
     """
     Stop training at NaN or infinity, with the step and the tensor's name, before the weights are damaged.
 
-    It checks gradients before every step of the optimiser, weights after it, rollouts before every update, losses and
-    the policy's statistics after it. ``CentralizedValueWrapper`` checks observations and rewards of teams.
+    It checks gradients before every step of the optimiser, rollouts before every update, losses, weights and the
+    policy's statistics after it. ``CentralizedValueWrapper`` checks observations and rewards of teams.
 
-    It checks sums, which keep NaN and infinity and read memory once. Per gradient step that is two sums per parameter,
-    and two numbers copied from the GPU.
+    It checks sums, which keep NaN and infinity and read memory once. Per gradient step that is one sum per parameter,
+    and one number copied from the GPU.
 
     ``resumable_learn`` adds it automatically.
     """
@@ -326,7 +326,6 @@ class FiniteCallback(BaseCallback):
         super().__init__()
         self._handles: list[RemovableHandle] = []
         self._sums: dict[str, th.Tensor] = {}
-        self._weights: dict[str, th.Tensor] = {}
         self._losses: dict[str, float] = {}
         self._n_optimizer_steps = 0
         self._n_checked = -1
@@ -334,12 +333,10 @@ class FiniteCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._remove_hooks()
         policy: Any = self.model.policy
-        learning = {name: weight for name, weight in policy.named_parameters() if weight.requires_grad}
-        for name, parameter in learning.items():
-            self._handles.append(parameter.register_post_accumulate_grad_hook(partial(self._note, name)))
-        self._weights = learning
+        for name, parameter in policy.named_parameters():
+            if parameter.requires_grad:
+                self._handles.append(parameter.register_post_accumulate_grad_hook(partial(self._note, name)))
         self._handles.append(policy.optimizer.register_step_pre_hook(self._check_gradients))
-        self._handles.append(policy.optimizer.register_step_post_hook(self._check_weights))
 
     def _on_training_end(self) -> None:
         self._check_update()
@@ -362,19 +359,11 @@ class FiniteCallback(BaseCallback):
     def _check_gradients(self, *_: object) -> None:
         sums, self._sums = self._sums, {}
         if not sums or math.isfinite(float(th.stack(list(sums.values())).sum())):
+            self._n_optimizer_steps += 1
             return
         for name, value in sums.items():  # in backward order, so the first is the nearest to the loss
             if not bool(value.isfinite()):
                 self._stop(f"the gradient of {name}", float(value))
-
-    def _check_weights(self, *_: object) -> None:
-        self._n_optimizer_steps += 1
-        with th.no_grad():
-            if math.isfinite(float(th.stack([weight.sum() for weight in self._weights.values()]).sum())):
-                return
-            for name, weight in self._weights.items():
-                if not math.isfinite(value := float(weight.sum())):
-                    self._stop(f"the weight {name}", value)
 
     # --- rollouts, losses, statistics -------------------------------------------------------------------------------
 

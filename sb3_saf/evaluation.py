@@ -23,7 +23,7 @@ from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array, NormalizedSpace
-from sb3_saf.teams.vec_env import episode_value, find_n_agents, layers, share_of_sum, team_dones
+from sb3_saf.teams.vec_env import episode_value, layers, require_n_agents, share_of_sum, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
 State = tuple[npt.NDArray[Any], ...] | None
@@ -262,7 +262,7 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
 
     :param act: returns the actions (B, ...) of all rows, from their observations and whether an episode starts, (B,)
     """
-    n_agents = _team_size(env)
+    n_agents = require_n_agents(env)
     n_games = env.num_envs // n_agents
     remaining = (n_episodes + np.arange(n_games)) // n_games
     observations: Any = env.reset()
@@ -314,7 +314,7 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
         read the agent's index
     :raises ValueError: if observations, actions, normalisation or, where it matters, the number of agents differ
     """
-    policy, n_agents = getattr(model, "policy", model), _team_size(env)
+    policy, n_agents = getattr(model, "policy", model), require_n_agents(env)
     if not isinstance(policy, TeamRowsPolicy):
         return
     trained, space = policy.team_spaces, env.observation_space
@@ -390,7 +390,7 @@ def evaluate_team(
     :raises ValueError: if ``env`` has no teams or a VecMonitor around them, or the model was trained on another game
     """
     check_count("n_eval_episodes", n_eval_episodes)
-    n_agents = _team_size(env)
+    n_agents = require_n_agents(env)
     monitored = is_vecenv_wrapped(env, TeamMonitor)
     if warn and not monitored:
         warnings.warn(
@@ -433,16 +433,6 @@ def evaluate_team(
         if render:
             env.render()
     return EvaluationResult(returns, lengths, tuple(successes), tuple(agent_returns))
-
-
-def _team_size(env: VecEnv) -> int:
-    n_agents = find_n_agents(env) if isinstance(env, VecEnv) else None
-    if n_agents is None:
-        raise ValueError(
-            f"expected a VecEnv of teams (with an attribute n_agents), got {type(env).__name__}; build it with "
-            "sb3_saf.make_team_env(...), or use stable_baselines3.common.evaluation.evaluate_policy for single agents"
-        )
-    return n_agents
 
 
 def evaluate_policy(

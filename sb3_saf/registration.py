@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-import warnings
 from collections.abc import Iterator
 from types import ModuleType
 from typing import Final
-
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import BasePolicy
 
 import sb3_saf.policies
 import sb3_saf.qplex
@@ -36,25 +32,11 @@ DECLARATIONS: Final[tuple[Declaration, ...]] = tuple(
 COMMANDS: Final[dict[str, AlgorithmSpec]] = {name: spec for one in DECLARATIONS for name, spec in one.commands.items()}
 
 
-def register(algorithm: type[BaseAlgorithm], name: str, policy: type[BasePolicy]) -> None:
-    """Register a policy with an algorithm by name. A name of another policy is not replaced, with a warning."""
-    known = algorithm.policy_aliases.setdefault(name, policy)
-    if (known.__module__, known.__qualname__) == (policy.__module__, policy.__qualname__):
-        algorithm.policy_aliases[name] = policy  # also after a reload of the module
-        return
-    warnings.warn(
-        f"{algorithm.__name__} already knows another policy by the name {name!r}, "
-        f"{known.__module__}.{known.__qualname__}; pass the class {policy.__module__}.{policy.__qualname__} instead "
-        "of its name",
-        stacklevel=2,
-    )
-
-
 def register_all() -> None:
     """Register every policy; called when ``sb3_saf`` is imported, the only side effect of the import."""
     for declaration in DECLARATIONS:
         for algorithm, policies in declaration.policies.items():
             for policy in policies:
-                register(algorithm, policy.__name__, policy)
+                algorithm.policy_aliases[policy.__name__] = policy
             for name in (f"{declaration.name}Policy", declaration.name, declaration.name.lower()):
-                register(algorithm, name, policies[0])
+                algorithm.policy_aliases[name] = policies[0]

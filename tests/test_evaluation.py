@@ -132,8 +132,8 @@ class TestEvaluatePolicy:
             evaluate_policy(StillPolicy(), env, 2, reward_threshold=6)
 
     def test_single_agents_are_refused(self) -> None:
-        for env, kind in ((DummyVecEnv([lambda: gym.make("CartPole-v1")]), "DummyVecEnv"), ("TeamTogether", "str")):
-            with pytest.raises(ValueError, match=f"n_agents.* got {kind}"):
+        for env, kind in ((DummyVecEnv([lambda: gym.make("CartPole-v1")]), "DummyVecEnv"), ("TeamTogether", "'Team")):
+            with pytest.raises(ValueError, match=f"VecEnv of flattened teams.* got {kind}"):
                 evaluate_policy(StillPolicy(), env, 2)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("n_episodes", [0, 2.5])

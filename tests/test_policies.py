@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from itertools import product
 from pathlib import Path
 from typing import Any, cast
@@ -18,14 +17,14 @@ from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy, TeamRolloutBuffer
 from sb3_saf.networks.layers import Linear, NormalizedReLU, mlp, side_by_side
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
-from sb3_saf.registration import DECLARATIONS, register
+from sb3_saf.registration import DECLARATIONS
 from sb3_saf.teams.rows import TeamSpaces
 from tests.toy_teams import PICTURE, VECTOR, CodeSpace, ToyTeams, gather_rows, team_rows, to_numpy
 
@@ -93,7 +92,7 @@ def make_policy(
     return policy
 
 
-def make_model(policy: str = "SAFPolicy", venv: ToyTeams | None = None, seed: int = 0, **kwargs: Any) -> PPO:
+def make_model(policy: str = "SAFPolicy", venv: VecEnv | None = None, seed: int = 0, **kwargs: Any) -> PPO:
     sizes = SMALL | (SMALL_SAF if policy == "SAFPolicy" else {}) | kwargs.pop("policy_kwargs", {})
     settings: dict[str, Any] = {"n_steps": 10, "batch_size": 40, "n_epochs": 2, "device": "cpu"}
     return PPO(policy, venv or ToyTeams(), seed=seed, policy_kwargs=sizes, **(settings | kwargs))
@@ -121,19 +120,6 @@ def test_names_are_registered_with_every_algorithm() -> None:
             for name in (declaration.name, declaration.name.lower(), f"{declaration.name}Policy"):
                 assert aliases[name] is policies[0]
     assert issubclass(A2C.policy_aliases["MlpPolicy"], ActorCriticPolicy)
-
-
-def test_names_that_belong_to_others_are_left_alone() -> None:
-    class Algorithm(PPO):
-        policy_aliases = {"SAFPolicy": ActorCriticPolicy}
-
-    with pytest.warns(UserWarning, match=r"Algorithm already knows another policy by the name 'SAFPolicy', .*pass the"):
-        register(Algorithm, "SAFPolicy", SAFPolicy)
-    assert Algorithm.policy_aliases["SAFPolicy"] is ActorCriticPolicy
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        register(Algorithm, "Mine", SAFPolicy)
-        register(Algorithm, "Mine", SAFPolicy)
 
 
 # --- the actor reads its own observation only -------------------------------------------------------------------------

@@ -159,7 +159,7 @@ def test_a_task_is_trained_on_and_played(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", _examples())
 def test_seeds_decide_what_happens(env_id: str) -> None:
-    if not suites()[env_id.partition("/")[0]].is_seeded:
+    if env_id.startswith("meltingpot/"):
         pytest.skip("its engine takes no seed")
     first, again, other = (_random_episodes(env_id, seed) for seed in (3, 3, 4))
     for step, same in zip(first, again, strict=True):

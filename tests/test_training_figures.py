@@ -9,8 +9,9 @@ from matplotlib.colors import to_hex
 from rliable import metrics
 from scipy import stats
 
+from benchmarks.paper import pooled, shares
 from sb3_saf import confidence_interval
-from sb3_saf.experiments.tables import compare, holm, mean_difference, pooled, shares
+from sb3_saf.experiments.tables import compare, holm, mean_difference
 from sb3_saf.training.figures import draw_curves, draw_levels, method_styles
 from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import (

@@ -45,16 +45,10 @@ def leave(games: Games, e: int, agent: int, cell: int) -> None:
 @inlined
 def count_around(games: Games, world: World, e: int, x: int, y: int) -> int:
     """Count the agents within ``support_radius`` (Chebyshev) of a cell."""
-    radius, width = world.support_radius, world.width
     total = 0
-    if (2 * radius + 1) * (2 * radius + 1) > world.n_agents:
-        for agent in range(world.n_agents):
-            if abs(games.x[e, agent] - x) <= radius and abs(games.y[e, agent] - y) <= radius:
-                total += 1
-        return total
-    for row in range(max(0, y - radius), min(width, y + radius + 1)):
-        for column in range(max(0, x - radius), min(width, x + radius + 1)):
-            total += games.crowd[e, row * width + column]
+    for agent in range(world.n_agents):
+        if abs(games.x[e, agent] - x) <= world.support_radius and abs(games.y[e, agent] - y) <= world.support_radius:
+            total += 1
     return total
 
 

@@ -30,6 +30,8 @@ TRIAL_SECONDS: Final = 1.0
 #: Packages whose objects are not searched for settings of a game, and limits of the search.
 _NO_SETTINGS: Final = ("builtins", "numpy", "torch", "jax", "jaxlib", "random", "threading", "_thread", "pygame")
 _MOST_SETTINGS: Final = 500
+#: Attributes of attributes that settings are looked for in.
+_DEPTH: Final = 2
 _MOST_ITEMS: Final = 50
 
 _RESET: Final = "(observations, infos)"
@@ -267,12 +269,11 @@ def layers_of(env: Any) -> list[Any]:
     return layers if any(layer is bare for layer in layers) else [*layers, bare]
 
 
-def settings_of(env: Any, depth: int = 3) -> dict[str, Any]:
+def settings_of(env: Any) -> dict[str, Any]:
     """
     Return what a new game keeps of its arguments: the numbers, flags and text among its attributes, by dotted names.
 
-    :param env: before its first episode
-    :param depth: how far attributes of attributes of the game and of each of its wrappers are followed
+    :param env: before its first episode; attributes of attributes are followed, of the game and of each of its wrappers
     """
     result: dict[str, Any] = {}
     layers = layers_of(env) if hasattr(env, "unwrapped") else [env]
@@ -281,14 +282,14 @@ def settings_of(env: Any, depth: int = 3) -> dict[str, Any]:
     while todo:
         name, value, level = todo.pop()
         for key, inner in sorted(vars(value).items()) if len(result) < _MOST_SETTINGS else ():
-            package = str(getattr(type(inner), "__module__", "builtins")).partition(".")[
-                0
-            ]  # some compiled types lack it
+            module = str(getattr(type(inner), "__module__", "builtins"))  # some compiled types lack it
             if _is_plain(inner):
                 result[f"{name}.{key}"] = inner
                 continue
-            may_hold_settings = package not in _NO_SETTINGS and hasattr(inner, "__dict__") and not callable(inner)
-            if level < depth - 1 and id(inner) not in visited and may_hold_settings:
+            may_hold_settings = (
+                module.partition(".")[0] not in _NO_SETTINGS and hasattr(inner, "__dict__") and not callable(inner)
+            )
+            if level < _DEPTH and id(inner) not in visited and may_hold_settings:
                 visited.add(id(inner))
                 todo.append((f"{name}.{key}", inner, level + 1))
     return result

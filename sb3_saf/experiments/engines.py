@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 import zipfile
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -37,7 +37,7 @@ _QUEUED_PER_SLOT: Final = 2
 _FEWEST_QUEUED: Final = 64
 
 
-class Engine(ABC):
+class Engine(contextlib.AbstractContextManager["Engine"]):
     """Base of engines that run jobs. A context manager; leaving it ends running jobs."""
 
     @property
@@ -57,9 +57,6 @@ class Engine(ABC):
     @abstractmethod
     def close(self) -> None:
         """End running jobs."""
-
-    def __enter__(self) -> Engine:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from textwrap import shorten
@@ -149,7 +149,7 @@ def run(
     return summary
 
 
-class _Progress:
+class _Progress(AbstractContextManager["_Progress"]):
     """Cells of one run: waiting, running, ended."""
 
     def __init__(
@@ -163,9 +163,6 @@ class _Progress:
         self.elsewhere: list[Cell] = []
         self._n_cells, self._clock = len(todo), time.monotonic()
         self._game_steps = {cell.id: config.settings(cell).game_steps for cell in todo if cell.is_trained}
-
-    def __enter__(self) -> _Progress:
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Release the locks of the cells."""

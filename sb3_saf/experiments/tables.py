@@ -374,7 +374,6 @@ def complete(rows: pd.DataFrame) -> pd.DataFrame:
 #: Differences below this share of the largest return do not matter.
 MARGIN: Final = 0.02
 _LEVEL: Final = 0.05
-_ON: Final = ["task", "level", "seed"]
 
 
 class Difference(NamedTuple):
@@ -463,11 +462,11 @@ def compare(first: pd.DataFrame, second: pd.DataFrame) -> Comparison | None:
     ours, theirs = (pairs[name].to_numpy(dtype=np.float64) for name in ("return_mean", "return_mean_second"))
     known = pairs["max_return"].iloc[0] if "max_return" in pairs else np.nan
     margin = MARGIN * float(known) if pd.notna(known) else np.nan
-    test = mean_difference(ours - theirs, float(np.sqrt(_variance(pairs).mean())), margin)
+    test = mean_difference(ours - theirs, float(np.sqrt(variance_of_tests(pairs).mean())), margin)
     return Comparison(pairs["seed"].tolist(), mean_over_seeds(ours), mean_over_seeds(theirs), test)
 
 
-def _variance(pairs: pd.DataFrame) -> Floats:
+def variance_of_tests(pairs: pd.DataFrame) -> Floats:
     """Return the variance of each pair's difference from the tests' episodes; 0 where it is not known."""
     if "return_sd" not in pairs:
         return np.zeros(len(pairs))
@@ -489,39 +488,6 @@ def comparisons(table: pd.DataFrame, view: View) -> list[Compared]:
                 if comparison is not None:
                     found.append(Compared(str(task), level, ours, other, comparison))
     return found
-
-
-def shares(table: pd.DataFrame, first: str, second: str) -> pd.DataFrame:
-    """
-    Return the paired differences of two methods in percent of the largest return.
-
-    :param table: table of tests
-    :return: columns ``setting``, ``seed``, ``difference`` and ``variance`` (of the tests), one row per pair
-    """
-    ours, theirs = (table[table["method"] == method] for method in (first, second))
-    pairs = ours.merge(theirs, on=["train_level", *_ON], suffixes=("", "_second"))
-    scale = 100 / pd.to_numeric(pairs["max_return"]).to_numpy(dtype=np.float64)
-    difference = (pairs["return_mean"] - pairs["return_mean_second"]).to_numpy(dtype=np.float64)
-    setting = pairs["task"] + " " + pairs["train_level"] + " " + pairs["level"]
-    variance = _variance(pairs) * scale**2
-    return pd.DataFrame(
-        {"setting": setting, "seed": pairs["seed"], "difference": difference * scale, "variance": variance}
-    )
-
-
-def pooled(pairs: pd.DataFrame) -> Difference | None:
-    """
-    Test the mean difference over settings: over those of their means if there are three or more, else over seeds.
-
-    :param pairs: from :func:`shares`
-    :return: in percent of the largest return; None without pairs
-    """
-    if pairs.empty:
-        return None
-    by = "setting" if pairs["setting"].nunique() >= FEWEST_SEEDS else "seed"
-    groups = pairs.groupby(by)
-    noise = float(np.sqrt((groups["variance"].mean() / groups.size()).mean()))
-    return mean_difference(groups["difference"].mean().to_numpy(), noise, 100 * MARGIN)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -29,7 +29,6 @@ from torch import nn
 from sb3_saf.export import act
 from sb3_saf.networks.actor import PolicyPool, PoolOutput, SinglePolicy
 from sb3_saf.networks.distributions import (
-    choices_of,
     is_one_hot,
     likeliest_action,
     masked_parameters,
@@ -45,7 +44,7 @@ from sb3_saf.qplex.policies import AgentMemory, QPLEXPolicy
 from sb3_saf.teams import conversion, package_version
 from sb3_saf.teams.checks import ExportError
 from sb3_saf.teams.files import atomic_file, write_text
-from sb3_saf.teams.rows import NormalizedSpace
+from sb3_saf.teams.rows import NormalizedSpace, choices_of
 
 #: Policies whose actors read only one agent's own observation, index, mask and memory.
 ExportablePolicy: TypeAlias = TeamPolicy | QPLEXPolicy

@@ -214,7 +214,9 @@ def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:
     """
     from PIL import Image
 
-    frames = [Image.fromarray(_scaled(picture)) for picture in pictures]
+    frames = [Image.fromarray(picture) for picture in pictures]
+    for frame in frames:
+        frame.thumbnail((frame.width, _HEIGHT), Image.Resampling.BILINEAR, reducing_gap=None)
     # One palette for all, from the first, the middle and the last frame.
     sample = np.concatenate([np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)])
     palette = Image.fromarray(sample).quantize(_COLOURS)
@@ -231,14 +233,3 @@ def png(picture: Picture) -> bytes:
     file = io.BytesIO()
     Image.fromarray(picture).save(file, "PNG", optimize=True)
     return file.getvalue()
-
-
-def _scaled(picture: Picture) -> Picture:
-    """Scale a picture down to ``_HEIGHT``."""
-    from PIL import Image
-
-    height, width, _ = picture.shape
-    if height <= _HEIGHT:
-        return picture
-    image = Image.fromarray(picture).resize((round(width * _HEIGHT / height), _HEIGHT), Image.Resampling.BILINEAR)
-    return np.asarray(image)

@@ -24,37 +24,16 @@ from stable_baselines3.common.distributions import (
     kl_divergence,
     make_proba_distribution,
 )
-from torch import nn
 from torch.distributions import Categorical, Normal, register_kl
 from torch.distributions import Distribution as TorchDistribution
 from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from sb3_saf.teams.checks import NonFiniteError
+from sb3_saf.teams.rows import choices_of
 
 #: Logit of masked actions: the probability is exactly zero, without the NaN in sums and gradients of -inf.
 _FORBIDDEN: Final = -1e8
-
-
-def choices_of(action_space: spaces.Space[Any]) -> tuple[int, ...]:
-    """
-    Return the number of choices of each action dimension, of which a Box has none.
-
-    :param action_space: Discrete, MultiDiscrete (of one axis), MultiBinary or Box
-    :raises ValueError: for any other space
-    """
-    if isinstance(action_space, spaces.Box):
-        return ()
-    if isinstance(action_space, spaces.Discrete):
-        return (int(action_space.n),)
-    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) == 1:
-        return tuple(action_space.nvec.tolist())
-    if isinstance(action_space, spaces.MultiBinary):
-        return (2,) * prod(action_space.shape)
-    raise ValueError(
-        f"expected a Discrete, MultiDiscrete (of one axis), MultiBinary or Box space, got {action_space}; flatten it "
-        "in a wrapper of the environment"
-    )
 
 
 def n_action_outputs(action_space: spaces.Space[Any]) -> int:

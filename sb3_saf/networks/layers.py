@@ -115,18 +115,7 @@ def mlp(sizes: Sequence[int], activation_fn: type[nn.Module], output_gain: float
 
 
 #: Activations that are the same function of every number, which nets may share.
-_ELEMENTWISE: Final = (
-    Tanh,
-    nn.ReLU,
-    nn.ELU,
-    nn.GELU,
-    nn.SiLU,
-    nn.LeakyReLU,
-    nn.Sigmoid,
-    nn.Softplus,
-    nn.Mish,
-    nn.Identity,
-)
+_ELEMENTWISE: Final = (Tanh, nn.ReLU, nn.ELU, nn.GELU, nn.SiLU, nn.LeakyReLU, nn.Sigmoid, nn.Softplus, nn.Mish)
 
 
 def side_by_side(groups: Sequence[Sequence[nn.Sequential]], x: th.Tensor) -> list[th.Tensor]:

@@ -256,7 +256,8 @@ class TeamPolicy(RememberingPolicy):
         :param obs: rows
         :param deterministic: whether to take the most likely actions
         :param action_masks: (B, M) of MaskablePPO; None allows everything
-        :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In a rollout, values are computed lazily
+        :return: actions (B, ...), values (B, 1), log-likelihoods (B,). In evaluation mode without gradients,
+            values are computed when they are read: read them before the weights change
         """
         encoded = self._encoded(obs, of_step=True)
         step, latents = (None, None) if self.actor_memory is None else self._advance(obs, encoded)

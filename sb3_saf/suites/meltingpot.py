@@ -120,6 +120,5 @@ SUITE: Final = Suite(
     list_tasks=_tasks,
     examples=("collaborative_cooking__cramped", "clean_up"),
     game=_game,
-    is_seeded=False,
     module="meltingpot",
 )

@@ -66,7 +66,6 @@ class Suite:
     :param level_params: parameters that name a level in logs; empty for all that are given
     :param always_active: whether all agents take part from beginning to end, so that rows need no ``"active"``
     :param is_drawn_from_state: whether games have ``grid_scene()`` and pictures at no cost
-    :param is_seeded: whether seeds determine its games
     :param module: module of the package, if it may be a source folder on ``PYTHONPATH`` instead of an installed package
     """
 
@@ -88,11 +87,7 @@ class Suite:
     level_params: tuple[str, ...] = ()
     always_active: bool = False
     is_drawn_from_state: bool = False
-    is_seeded: bool = True
     module: str | None = None
-
-    def __post_init__(self) -> None:
-        assert self.game is not None or self.vec_env is not None, f"{self.name}: neither game nor vec_env"
 
     @property
     def requirements(self) -> tuple[Requirement, ...]:

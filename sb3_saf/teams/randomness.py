@@ -18,7 +18,7 @@ _SEED_BITS: Final = 32
 _STRIDE: Final = 0x9E3779B1
 
 
-def game_seeds(seed: int | None, n_games: int, first: int = 0) -> list[int]:
+def game_seeds(seed: int | None, n_games: int) -> list[int]:
     """
     Return the seeds of the games of a vector environment.
 
@@ -27,7 +27,6 @@ def game_seeds(seed: int | None, n_games: int, first: int = 0) -> list[int]:
 
     :param seed: the run's seed, 0 or larger, of any size; None draws one from the operating system
     :param n_games: E, number of games
-    :param first: index of the first game
     :return: E integers below 2**32
     :raises ValueError: for an invalid seed
     """
@@ -36,7 +35,7 @@ def game_seeds(seed: int | None, n_games: int, first: int = 0) -> list[int]:
     elif isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0:
         raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
     start = int(np.random.SeedSequence(int(seed)).generate_state(1, np.uint32)[0])
-    return [(start + index * _STRIDE) % 2**_SEED_BITS for index in range(first, first + n_games)]
+    return [(start + index * _STRIDE) % 2**_SEED_BITS for index in range(n_games)]
 
 
 @contextmanager

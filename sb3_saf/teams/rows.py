@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import prod
 from typing import Any, Final
 
 import numpy as np
@@ -291,15 +292,31 @@ def n_mask_entries(action_space: spaces.Space[Any]) -> int | None:
     return None
 
 
+def choices_of(action_space: spaces.Space[Any]) -> tuple[int, ...]:
+    """
+    Return the number of choices of each action dimension, of which a Box has none.
+
+    :param action_space: Discrete, MultiDiscrete (of one axis), MultiBinary or Box
+    :raises ValueError: for any other space
+    """
+    if isinstance(action_space, spaces.Box):
+        return ()
+    if isinstance(action_space, spaces.Discrete):
+        return (int(action_space.n),)
+    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) == 1:
+        return tuple(action_space.nvec.tolist())
+    if isinstance(action_space, spaces.MultiBinary):
+        return (2,) * prod(action_space.shape)
+    raise ValueError(
+        f"expected a Discrete, MultiDiscrete (of one axis), MultiBinary or Box space, got {action_space}; flatten it "
+        "in a wrapper of the environment"
+    )
+
+
 def first_choices(action_space: spaces.Space[Any]) -> Array:
     """Return the mask (A,) int8 that allows only the first choice of each dimension of the actions."""
-    n_entries = n_mask_entries(action_space)
-    assert n_entries is not None, "actions with masks"
-    mask = np.zeros(n_entries, dtype=np.int8)
-    if isinstance(action_space, spaces.MultiDiscrete):
-        mask[np.cumsum(action_space.nvec) - action_space.nvec] = 1
-    else:
-        mask[:: 2 if isinstance(action_space, spaces.MultiBinary) else n_entries] = 1
+    mask = np.zeros(n_mask_entries(action_space) or 0, dtype=np.int8)
+    mask[np.cumsum([0, *choices_of(action_space)[:-1]])] = 1
     return mask
 
 

@@ -161,7 +161,7 @@ class Settings:
         if evaluation and suite is not None:
             params = {key: value for key, value in params.items() if key not in suite.training_params}
         if {"env_wrapper", "frame_stack"} & self.wrapping.keys():  # of single games, not of compiled ones
-            source, backend = replace(self.environment, make=self.make_game), "supersuit"
+            source, backend = replace(self.environment, make=self._make_game), "supersuit"
         env = make_team_env(
             source,
             n_envs=self.n_envs if n_envs is None else n_envs,
@@ -178,14 +178,9 @@ class Settings:
         )
         return wrap_rows(env, self.wrapping, float(self.plain.get("gamma", 0.99)), is_training=not evaluation)
 
-    def make_game(self, render_mode: str | None = None, **changes: Any) -> Any:
-        """
-        Make one game, a PettingZoo ParallelEnv with the wrappers of the settings.
-
-        :param render_mode: render mode of the game; None for no rendering
-        :param changes: parameters that differ from ``env_kwargs``
-        """
-        return wrap_game(self.environment.make_game({**self.env_kwargs, **changes}, render_mode), self.wrapping)
+    def _make_game(self, render_mode: str | None = None, **params: Any) -> Any:
+        """Make one game, a PettingZoo ParallelEnv with the wrappers of the settings."""
+        return wrap_game(self.environment.make_game(params, render_mode), self.wrapping)
 
     def make_model(
         self,
