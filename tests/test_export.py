@@ -31,6 +31,7 @@ from sb3_saf import (
     MAPPOPolicy,
     SAFPolicy,
     export_actors,
+    game_seeds,
     load_weights,
     make_team_env,
     save_weights,
@@ -100,6 +101,17 @@ def plain(policy_class: type[TeamActorCriticPolicy], own: spaces.Space[Any], act
     return make_policy(policy_class, own, ACTIONS[action], noise=0.6, **kwargs)
 
 
+def sure() -> Any:
+    """Create a policy of flags with large logits, except for the first observation of :func:`rows_of`."""
+    policy = plain(MAPPOPolicy, spaces.Discrete(5), "multi-binary", seed=2)
+    rows = {key: th.as_tensor(value) for key, value in rows_of(policy, 1).items()}
+    output = list(policy.actor.modules())[-1]
+    with th.no_grad():
+        output.weight.mul_(20)
+        output.bias.sub_(policy.get_distribution(rows).distribution.logits[0] + th.tensor([0.5, -0.5]))
+    return policy
+
+
 def maskable(name: str, action: str) -> Any:
     return test_contrib.make_policy(name, ACTIONS[action], noise=0.6)
 
@@ -110,7 +122,7 @@ POLICIES: dict[str, Callable[[], Any]] = {
     "pool, codes": lambda: plain(SAFPolicy, CodeSpace(), "discrete"),
     "pool with identity, pictures": lambda: plain(SAFPolicy, PICTURE, "multi-discrete", **_PAIRS),
     "gumbel pool, box": lambda: plain(SAFPolicy, spaces.MultiBinary(4), "box", selection="gumbel"),
-    "shared, choices": lambda: plain(MAPPOPolicy, spaces.Discrete(5), "multi-binary", seed=2),
+    "shared, sure choices": sure,
     "heads, grey pictures": lambda: plain(IPPOPolicy, GREY, "box", heads="per_agent"),
     "own encoder": lambda: plain(MAPPOPolicy, VECTOR, "discrete", features_extractor_class=OwnEncoder),
     "masked rows": lambda: masked(SAFPolicy, selection="gumbel", latent_dim=8, projection_arch=(10,)),
@@ -159,13 +171,16 @@ def test_decides_as_the_model_does(name: str, exports: Callable[[str], Exported]
             distribution = policy.get_distribution(tensors)
             likelihoods = distribution.log_prob(th.as_tensor(actions).float())  # SB3's MultiBinary takes floats
         np.testing.assert_allclose(actor.log_prob(obs, actions), likelihoods, rtol=1e-5, atol=1e-5)
+        assert "sure" not in name or likelihoods.min() < -20
         if isinstance(policy.action_space, spaces.Discrete):
             probabilities = distribution.distribution.probs.numpy()
             np.testing.assert_allclose(actor.probabilities(obs), probabilities, atol=2e-6)
             np.testing.assert_allclose(actor.probabilities(obs[3]), probabilities[3], atol=2e-6)
 
 
-@pytest.mark.parametrize("name", ["pool, codes", "pool with identity, pictures", "gumbel pool, box", "shared, choices"])
+@pytest.mark.parametrize(
+    "name", ["pool, codes", "pool with identity, pictures", "gumbel pool, box", "shared, sure choices"]
+)
 def test_draws_as_the_model_does(name: str, exports: Callable[[str], Exported]) -> None:
     policy, _, actor = exports(name)
     count, rows = 4_000, rows_of(policy, 1)
@@ -346,7 +361,20 @@ def test_acts_on_what_the_game_gives(kind: str, masks: str, tmp_path: Path) -> N
     folder = export_actors(model, tmp_path)
     actor, game = Actor.load(folder), Kinds(kind, masks)
     alone = {agent: Actor.load(folder, agent=agent) for agent in game.possible_agents}
-    observations, infos = game.reset(seed=3)
+    observations, infos = game.reset(seed=game_seeds(0, 1)[0])
+    rows, _ = model.policy.obs_to_tensor(env.reset())
+    with th.no_grad():
+        probabilities = model.policy.get_distribution(rows).distribution.probs.numpy()
+    given: Any = observations if masks != "info" else (observations, infos)
+    for choice in range(3):  # as the games count them: those of some agents begin with 2
+        actions = {agent: cast(Any, game.action_space(agent)).start + choice for agent in game.possible_agents}
+        likelihoods = np.exp(actor.log_prob(given, actions))
+        np.testing.assert_allclose(likelihoods, probabilities[:, choice], atol=1e-5)
+        for index, (agent, action) in enumerate(actions.items()):
+            found = alone[agent].log_prob(observations[agent], action, action_mask=mask_in(infos[agent]))
+            np.testing.assert_allclose(np.exp(found), likelihoods[index], atol=1e-5)
+    with pytest.raises(ValueError, match=r"expected \{agent: action\} of \['agent', 'b', 'c'\]"):
+        actor.log_prob(given, [1, 1, 1])
     while game.agents:
         expected, _ = model.predict((observations, infos), deterministic=True)
         given = observations if masks != "info" else (observations, infos)
@@ -359,43 +387,6 @@ def test_acts_on_what_the_game_gives(kind: str, masks: str, tmp_path: Path) -> N
         drawn = actor.act(given, deterministic=False, rng=0)
         observations, _, _, _, infos = game.step(drawn)  # which checks the actions
         observations = {agent: observations[agent] for agent in game.agents}
-
-
-def test_likelihoods_of_actions_as_the_game_counts_them(tmp_path: Path) -> None:
-    class Started(Named):
-        def action_space(self, agent: Any) -> spaces.Space[Any]:
-            return spaces.Discrete(4, start=1)
-
-    env = make_team_env(Started, 1, seed=0, names="ab")
-    model: Any = PPO("MAPPOPolicy", env, seed=0, device="cpu")
-    with th.no_grad():
-        for parameter in model.policy.actor.parameters():
-            parameter.add_(0.5 * th.randn_like(parameter))
-    actor = Actor.load(export_actors(model, tmp_path))
-    observations, _ = Started("ab").reset()
-    rows, _ = model.policy.obs_to_tensor(env.reset())
-    with th.no_grad():
-        probabilities = model.policy.get_distribution(rows).distribution.probs.numpy()
-    for action in range(1, 5):
-        found = actor.log_prob(observations, {"a": action, "b": action})
-        np.testing.assert_allclose(np.exp(found), probabilities[:, action - 1], atol=1e-5)
-        np.testing.assert_allclose(actor.log_prob(observations["a"], action), found[0], atol=1e-6)
-    with pytest.raises(ValueError, match=r"expected \{agent: action\} of \['a', 'b'\]"):
-        actor.log_prob(observations, [1, 1])
-
-
-def test_confident_choices_of_flags_are_exported(tmp_path: Path) -> None:
-    policy = make_policy(MAPPOPolicy, VECTOR, spaces.MultiBinary(4))
-    with th.no_grad():
-        for parameter in policy.actor.parameters():
-            parameter.mul_(20)
-    actor = Actor.load(export_actors(policy, tmp_path), agent=0)
-    rows, actions = rows_of(policy, 40), samples(policy.action_space, 40)
-    with th.no_grad():
-        distribution = policy.get_distribution({key: th.as_tensor(value) for key, value in rows.items()})
-        expected = distribution.log_prob(th.as_tensor(actions).float())
-    assert expected.min() < -20
-    np.testing.assert_allclose(actor.log_prob(rows["obs"], actions), expected, rtol=1e-5, atol=1e-5)
 
 
 # --- programs with nothing but the files ------------------------------------------------------------------------------
@@ -458,19 +449,30 @@ def test_other_policies_are_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_network_with_other_numbers_is_not_written(tmp_path: Path) -> None:
-    policy = make_policy(IPPOPolicy)
+def test_a_network_with_other_numbers_is_not_written(
+    exports: Callable[[str], Exported], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, folder, _ = exports("own encoder")
+    graph = (folder / "actor.onnx").read_bytes()
+    monkeypatch.setattr("sb3_saf.export.writer._written", lambda *_: graph)
+    assert (export_actors(policy, tmp_path / "same") / "actor.onnx").read_bytes() == graph
     extract = policy.extract_features
-    policy.extract_features = lambda *args: extract(*args) + 0.5  # type: ignore[method-assign]
+    monkeypatch.setattr(policy, "extract_features", lambda *args: extract(*args) + 0.5)
     with pytest.raises(ExportError, match="does more than its encoder and actor"):
         export_actors(policy, tmp_path / "actor")
     assert not (tmp_path / "actor").exists()
 
 
-def test_an_export_without_its_normalisation_warns(tmp_path: Path) -> None:
+def test_an_export_without_its_normalisation_warns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = VecNormalize(make_team_env(CounterEnv, n_envs=2, seed=0).venv, norm_obs_keys=["obs"])
     policy: Any = PPO("IPPOPolicy", CentralizedValueWrapper(rows), device="cpu").policy
-    with pytest.warns(UserWarning, match="normalise what the actors observe"):
+
+    def written(network: Any, inputs: Any, _: Any) -> bytes:
+        assert network(inputs)[0].shape == (16,)
+        raise ExportError("not written here")
+
+    monkeypatch.setattr("sb3_saf.export.writer._written", written)
+    with pytest.warns(UserWarning, match="normalise what the actors observe"), pytest.raises(ExportError, match="here"):
         export_actors(policy, tmp_path / "actor")  # it has no games to look at
 
 
@@ -501,7 +503,7 @@ def test_an_agent_that_matters_must_be_named(exports: Callable[[str], Exported])
         ("own encoder", ["a"] * 5, "observation of float32.* does not fit"),
         ("pool, codes", np.full((3, 3), 20), "observation of at least 0 and below 20"),
         ("pool, codes", np.full((3, 3), -1), "observation of uint8.* does not fit"),
-        ("shared, choices", 5, "observation of at least 0 and below 5"),
+        ("shared, sure choices", 5, "observation of at least 0 and below 5"),
     ],
 )
 def test_observations_of_another_kind_are_refused(
