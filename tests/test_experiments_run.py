@@ -35,7 +35,7 @@ from sb3_saf.training.train import main as train_main
 from tests.experiments_jobs import InlineEngine, is_running, read_table, wait_until
 from tests.toy_envs import Game
 
-SMOKE = RunConfig("smoke", episodes=32, eval_freq=200, eval_episodes=2)
+SMOKE = RunConfig("smoke", {"game_steps": 120, "learning_rate": 0.01}, episodes=32, eval_freq=60, eval_episodes=2)
 #: Two methods that train fast, and a random team, at a level of ``joint``.
 TWO = Selection((0, 1), ("ippo", "mappo"), (), ("2",))
 N_CELLS = 2 * 2 + 2
@@ -90,7 +90,7 @@ def test_the_table_has_a_row_for_each_cell_and_level(undisturbed: Path) -> None:
         assert len(own) == 4 and sum(own) == pytest.approx(float(row["return_mean"]))
         assert float(row["return_low"]) <= float(row["return_mean"]) <= float(row["return_high"])
         assert float(row["score"]) == pytest.approx(float(row["return_mean"]) / 6)
-        assert row["game_steps"] == ("0" if row["method"] == "random" else "400")
+        assert row["game_steps"] == ("0" if row["method"] == "random" else "120")
     assert len({(row["return_mean"], row["return_sd"]) for row in table}) == N_CELLS  # seeds and methods differ
 
 
@@ -101,8 +101,8 @@ def test_a_cell_has_everything_to_be_understood_and_trained_again(undisturbed: P
     assert names == {"run.json", "curve.csv", "evaluations.csv", *models, "tests/c2-h2.json", "finished.json"}
     description, finished = read_json(folder / "run.json"), read_json(folder / "finished.json")
     settings = description["settings"]
-    assert (settings["algo"], settings["game_steps"], settings["env_kwargs"]["coordination"]) == ("mappo", 400, 2)
-    protocol = {"episodes": 32, "eval_freq": 200, "eval_episodes": 2}
+    assert (settings["algo"], settings["game_steps"], settings["env_kwargs"]["coordination"]) == ("mappo", 120, 2)
+    protocol = {"episodes": 32, "eval_freq": 60, "eval_episodes": 2}
     assert description["seed"] == 1
     assert description["options"] == {"method": "mappo", "level": {"coordination": 2, "heterogeneity": 2}, **protocol}
     assert description["versions"]["torch"] == th.__version__ and description["versions"]["commit"]
@@ -110,7 +110,7 @@ def test_a_cell_has_everything_to_be_understood_and_trained_again(undisturbed: P
     assert set(finished["files"]) == names - {"finished.json"}
     points = np.genfromtxt(folder / "curve.csv", delimiter=",", names=True)
     assert points.dtype.names == ("game_steps", "processor_seconds", "score", "episodes")
-    assert points["game_steps"][-1] == 400
+    assert points["game_steps"][-1] == 120
     assert (np.diff(points["processor_seconds"]) >= 0).all()
     assert points["processor_seconds"][-1] == pytest.approx(finished["processor_seconds"], abs=0.1)
 
@@ -132,8 +132,8 @@ def assert_same_weights(first: Path, second: Path) -> None:
 
 def test_evaluations_do_not_change_the_training(undisturbed: Path, tmp_path: Path) -> None:
     """With others, or fewer: the same last policy, bit for bit, and the same learning curve."""
-    run_inline(tmp_path, replace(TWO, seeds=(1,), methods=("mappo",)), config=replace(SMOKE, eval_freq=40))
-    for folder, steps in ((undisturbed, [200, 400]), (tmp_path, [40 * n for n in range(1, 11)])):
+    run_inline(tmp_path, replace(TWO, seeds=(1,), methods=("mappo",)), config=replace(SMOKE, eval_freq=20))
+    for folder, steps in ((undisturbed, [60, 120]), (tmp_path, [20, 60, 100, 120])):
         evaluations = read_table(cell_of(folder) / "evaluations.csv")
         assert [int(row["game_steps"]) for row in evaluations] == steps
         best = max(evaluations, key=lambda row: float(row["return_mean"]))
@@ -180,7 +180,8 @@ def test_cells_depend_on_nothing_but_themselves(undisturbed: Path, tmp_path: Pat
 def test_a_killed_run_leaves_no_worker_and_continues(undisturbed: Path, tmp_path: Path) -> None:
     """With the real workers; one of them is killed too, and its cell retried."""
     words = ["joint", "--size", "smoke", "--methods", "ippo", "--levels", "2", "--seeds", "0", "1", "--workers", "1"]
-    words += ["-f", str(tmp_path), "--episodes", "32"]
+    words += ["-f", str(tmp_path), "--episodes", "32", "-n", "120", "--eval-freq", "60", "--eval-episodes", "2"]
+    words += ["-params", "learning_rate:0.01"]
     process = subprocess.Popen([sys.executable, "-m", "sb3_saf.experiments", "run", *words], stdout=subprocess.DEVNULL)
     wait_until(lambda: list(tmp_path.glob("unfinished/*/*/*/job.json")))
     subprocess.run(["kill", "-9", str(worker_of(process.pid))], check=True)
@@ -269,10 +270,11 @@ def test_a_failed_cell_says_why_and_is_tried_again(tmp_path: Path, capsys: pytes
 
 
 def test_a_cell_that_diverges_is_one_line_and_the_exit_code_is_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setattr(cli, "LocalEngine", lambda *_: InlineEngine())
     words = ["run", "joint", "--size", "smoke", "--seeds", "0", "--levels", "2", "--methods", "ippo", "-n", "80"]
-    words += ["--episodes", "2", "--retries", "0", "--workers", "1"]
+    words += ["--episodes", "2", "--retries", "0"]
     words += ["-f", str(tmp_path), "-params", "learning_rate:1.0e30"]
     assert cli.main(words) == 1
     printed = capsys.readouterr()
@@ -287,9 +289,9 @@ def refused(folder: Path, config: RunConfig) -> str:
 
 
 def test_other_settings_are_refused(undisturbed: Path) -> None:
-    message = refused(undisturbed, replace(SMOKE, overrides={"game_steps": 800, "learning_rate": 1e-3}))
-    assert "overrides.game_steps was None, now 800" in message
-    assert "overrides.learning_rate was None, now 0.001" in message
+    message = refused(undisturbed, replace(SMOKE, overrides={"game_steps": 800, "gamma": 0.9}))
+    assert "overrides.game_steps was 120, now 800" in message
+    assert "overrides.gamma was None, now 0.9" in message
     assert "size was 'smoke', now 'small'" in refused(undisturbed, RunConfig("small"))
     assert "episodes was 32, now 8" in refused(undisturbed, replace(SMOKE, episodes=8))
 
@@ -467,7 +469,7 @@ def attempt(folder: Path, step: int | None = None) -> int:
 def test_a_cell_that_was_killed_goes_on_from_its_checkpoint(
     method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = replace(SMOKE, overrides={"game_steps": 200})
+    short = replace(SMOKE, overrides={"game_steps": 200}, eval_freq=200)
     whole, killed = (job_in(tmp_path / name, method, tests=2, config=short) for name in ("whole", "killed"))
     n_steps = attempt(whole)
     n_tests = 2 if method == "qplex" else 4  # best and last policy, drawn and most likely actions
@@ -503,7 +505,7 @@ def untimed(path: Path) -> Any:
 
 def test_a_cell_killed_after_its_model_was_saved_does_not_train_anew(tmp_path: Path) -> None:
     """Checkpoints go last."""
-    short = replace(SMOKE, overrides={"game_steps": 200})
+    short = replace(SMOKE, overrides={"game_steps": 200}, eval_freq=200)
     whole, killed = (job_in(tmp_path / name, config=short) for name in ("whole", "killed"))
     n_steps = attempt(whole)
 

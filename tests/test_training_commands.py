@@ -39,9 +39,9 @@ ENV = "TeamTogether-v0"
 
 
 def train(folder: Path, *options: str, algo: str = "saf") -> Path:
-    """Train at smoke size with seed 3; return the run's folder."""
+    """Train 80 game steps, by default, at smoke size with seed 3; return the run's folder."""
     before = {path.parent for path in folder.glob("*/*/monitor.csv")}
-    given = ("--size", "smoke", "--seed", "3", "--eval-episodes", "4", "--env", ENV, "-f", str(folder))
+    given = ("--size", "smoke", "-n", "80", "--seed", "3", "--eval-episodes", "4", "--env", ENV, "-f", str(folder))
     zoo_train.main(["--algo", algo, *given, *options])
     (run,) = {path.parent for path in folder.glob("*/*/monitor.csv")} - before
     return run
@@ -49,7 +49,7 @@ def train(folder: Path, *options: str, algo: str = "saf") -> Path:
 
 @pytest.fixture(scope="module")
 def settings() -> Settings:
-    return load_settings("saf", ENV, "smoke")
+    return load_settings("saf", ENV, "smoke", overrides={"game_steps": 80})
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +66,11 @@ def test_the_command_trains_what_settings_train(by_hand: dict[str, bytes], tmp_p
 
 def test_options_do_not_change_what_is_learned(settings: Settings, by_hand: dict[str, bytes], tmp_path: Path) -> None:
     assert by_hand == weights_of(train_settings(settings, 3))
-    frequencies: dict[str, Any] = {"eval_freq": 60, "save_freq": 100, "inspect_freq": 10_000, "checkpoint_freq": None}
+    frequencies: dict[str, Any] = {"eval_freq": 12, "save_freq": 40, "inspect_freq": 10_000, "checkpoint_freq": None}
     options = RunOptions(eval_episodes=4, tensorboard_log=tmp_path, **frequencies)
     folder = tmp_path / "run"
     assert by_hand == weights_of(train_settings(settings, 3, folder, options))
-    assert {"model.zip", "best_model.zip", "evaluations.npz", "monitor.csv", "rl_model_400_steps.zip"} <= {
+    assert {"model.zip", "best_model.zip", "evaluations.npz", "monitor.csv", "rl_model_80_steps.zip"} <= {
         path.name for path in folder.iterdir()
     }
     assert not (folder / "checkpoints").exists()
@@ -100,28 +100,28 @@ def test_value_based_algorithms_are_evaluated_without_exploring(tmp_path: Path) 
 
 
 def test_frequencies_count_game_steps(tmp_path: Path) -> None:
-    run = train(tmp_path, "--eval-freq", "150", "--save-freq", "200", "-n", "400")
+    run = train(tmp_path, "--eval-freq", "30", "--save-freq", "40")
     with np.load(run / "evaluations.npz") as arrays:
         # Four games play 4 steps at a time; the final policy is always evaluated.
-        assert arrays["game_steps"].tolist() == [152, 300, 400]
+        assert arrays["game_steps"].tolist() == [32, 60, 80]
         assert arrays["results"].shape == (3, 4)
-    assert sorted(path.name for path in run.glob("rl_model_*")) == ["rl_model_200_steps.zip", "rl_model_400_steps.zip"]
-    assert PPO.load(run / "rl_model_200_steps.zip").num_timesteps == 200 * 4
-    assert PPO.load(run / f"{ENV}.zip").num_timesteps == 400 * 4
+    assert sorted(path.name for path in run.glob("rl_model_*")) == ["rl_model_40_steps.zip", "rl_model_80_steps.zip"]
+    assert PPO.load(run / "rl_model_40_steps.zip").num_timesteps == 40 * 4
+    assert PPO.load(run / f"{ENV}.zip").num_timesteps == 80 * 4
 
 
 def test_short_runs_train_more_than_they_evaluate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """At most one evaluation for each of the ten rollouts, at any frequency."""
-    run = train(tmp_path, "--eval-freq", "1", "-n", "400")
+    """At most one evaluation for each of the three rollouts, at any frequency."""
+    run = train(tmp_path, "--eval-freq", "1", "-n", "120")
     with np.load(run / "evaluations.npz") as arrays:
         steps = arrays["game_steps"]
-    assert len(steps) == 11 and len(set((steps[:-1] - 1) // 40)) == 10 and steps[-1] == 400
+    assert len(steps) == 4 and len(set((steps[:-1] - 1) // 40)) == 3 and steps[-1] == 120
     assert re.search(r"^Evaluation took \d+% of \d+ s", capsys.readouterr().out, re.MULTILINE)
 
 
 @pytest.mark.parametrize(("options", "length"), [((), 6), (("--eval-env-kwargs", "max_cycles:5"), 5)])
 def test_evaluation_plays_its_level(options: tuple[str, ...], length: int, tmp_path: Path) -> None:
-    run = train(tmp_path, "--env-kwargs", "max_cycles:6", "coordination:2", "--eval-freq", "400", *options)
+    run = train(tmp_path, "--env-kwargs", "max_cycles:6", "coordination:2", "--eval-freq", "80", *options)
     with np.load(run / "evaluations.npz") as arrays:
         assert set(arrays["ep_lengths"].ravel()) == {length}
     assert {line.split(",")[1] for line in (run / "monitor.csv").read_text().splitlines()[2:]} == {"6"}
@@ -133,7 +133,8 @@ def test_a_run_keeps_what_it_was(tmp_path: Path) -> None:
     assert run == tmp_path / "saf-no-pool" / f"{ENV}_1"
     description = Run(run).description
     overrides = {"gamma": 0.9, "policy_kwargs": {"n_slots": 3}}
-    assert description["settings"] == load_settings("saf-no-pool", ENV, "smoke", overrides=overrides).as_dict()
+    settings = load_settings("saf-no-pool", ENV, "smoke", overrides=overrides | {"game_steps": 80})
+    assert description["settings"] == settings.as_dict()
     assert description["seed"] == 3 and description["options"]["eval_episodes"] == 4
     assert {"stable-baselines3", "sb3-saf", "commit"} <= set(description["versions"])
     assert description["command"].startswith("python -m sb3_saf.train --algo saf-no-pool --size smoke")
@@ -180,7 +181,7 @@ def test_the_progress_bar_counts_game_steps() -> None:
 
 
 def test_a_line_for_every_tenth(capsys: pytest.CaptureFixture[str]) -> None:
-    settings = load_settings("ippo", ENV, "smoke", overrides={"game_steps": 400})
+    settings = load_settings("ippo", ENV, "smoke", overrides={"game_steps": 80})
     settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=ProgressLines())
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(" of ")[0].strip() for line in lines] == [f"{tenth} %" for tenth in range(10, 101, 10)]
@@ -254,9 +255,7 @@ default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRo
 
 def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Also with stages, whose games have one layer more than those of evaluation; they are read by all commands."""
-    given = (
-        f"--env {COUNTER} --seed 0 --size smoke -f {tmp_path} --eval-freq 80 --eval-episodes 2 -n 400 --save-freq 200"
-    )
+    given = f"--env {COUNTER} --seed 0 --size smoke -f {tmp_path} --eval-freq 40 --eval-episodes 2 -n 80 --save-freq 40"
     settings = ["normalize:True", "curriculum:[{share: 0.5, max_cycles: 4}]"]
     zoo_train.main([*given.split(), "--verbose", "0", "-params", *settings])
     run = tmp_path / "saf" / "tests.toy_envs-CounterEnv_1"
@@ -264,17 +263,17 @@ def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest
     for path in run.glob("*.vecnormalize.npz"):
         with np.load(path) as statistics:
             counts[path.name.partition(".vecnormalize")[0]] = float(statistics["obs count"])
-    assert counts["rl_model_200_steps"] < counts["tests.toy_envs-CounterEnv"]
+    assert counts["rl_model_40_steps"] < counts["tests.toy_envs-CounterEnv"]
     assert {path.stem for path in run.glob("*.zip")} == set(counts)
     watch = ["--env", COUNTER, "-f", str(tmp_path), "--episodes", "2", "--no-render"]
-    zoo_enjoy.enjoy([*watch, "--load-checkpoint", "200"])
-    model = run / "rl_model_200_steps.zip"
+    zoo_enjoy.enjoy([*watch, "--load-checkpoint", "40"])
+    model = run / "rl_model_40_steps.zip"
     write_page(["--model", str(model), "-o", str(tmp_path / "page.html")])
     other = [*given.split(), "-i", str(model)]
     assert "was trained with normalize; give it the same setting" in failed(other, capsys)
     model.with_suffix(".vecnormalize.npz").unlink()
     words = "cannot read the statistics of normalize"
-    assert words in failed([*watch, "--load-checkpoint", "200"], capsys, zoo_enjoy.main)
+    assert words in failed([*watch, "--load-checkpoint", "40"], capsys, zoo_enjoy.main)
     both = ["--model", str(model), str(run / "best_model.zip")]
     assert "a model with normalize is shown alone" in failed(both, capsys, replay_main)
     assert words in failed(both[:2], capsys, replay_main)

@@ -38,11 +38,11 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
 
     def train(algo: str, *options: str) -> None:
-        given = ("--size", "smoke", "-n", "160", "--eval-freq", "80", "--eval-episodes", "4", "--verbose", "0")
+        given = ("--size", "smoke", "-n", "80", "--eval-freq", "40", "--eval-episodes", "4", "--verbose", "0")
         zoo_train.main(["--algo", algo, "--env", ENV, "-f", str(folder), *given, *options])
 
     for coordination in (1, 2):
-        train("saf", "--seed", "0", "--env-kwargs", f"coordination:{coordination}", "--save-freq", "80")
+        train("saf", "--seed", "0", "--env-kwargs", f"coordination:{coordination}", "--save-freq", "40")
         train("saf", "--seed", "1", "--env-kwargs", f"coordination:{coordination}")
         train("mappo", "--seed", "0", "--env-kwargs", f"coordination:{coordination}")
     train("saf-gru", "--seed", "0")
@@ -77,7 +77,7 @@ def test_latest_run_by_default_and_other_models_on_demand(logs: Path, capsys: py
     assert f"{ENV}_4/{ENV}.zip" in capsys.readouterr().out
     for option, name in (
         (["--load-best"], "best_model.zip"),
-        (["--load-checkpoint", "80"], "rl_model_80_steps.zip"),
+        (["--load-checkpoint", "40"], "rl_model_40_steps.zip"),
     ):
         result = enjoy(logs, "--exp-id", "1", "--no-render", *option)
         printed = capsys.readouterr().out
@@ -130,7 +130,7 @@ def test_a_window_needs_a_display(
         (["--algo", "ippo"], "python -m sb3_saf.train --algo ippo"),
         (["-f", "nowhere"], "there is no folder nowhere/saf; train first"),
         (["--env", "TeamSupport-v0"], "there is no run of TeamSupport-v0"),
-        (["--load-checkpoint", "81"], "has no rl_model_81_steps.zip"),
+        (["--load-checkpoint", "41"], "has no rl_model_41_steps.zip"),
         (["--gif", "film.mp4"], "a file that ends with .gif"),
         (["--gif", "a.gif", "--text"], "not allowed with"),
     ],
@@ -186,14 +186,14 @@ def test_results_of_a_run(logs: Path) -> None:
     with np.load(run.folder / "evaluations.npz") as arrays:
         means = arrays["results"].mean(axis=1)
     curve = run.curve("evaluation")
-    assert curve["game_steps"].tolist() == [80, 160]
+    assert curve["game_steps"].tolist() == [40, 80]
     assert curve["score"].tolist() == means.tolist()
     training = run.curve("training")
     returns = np.genfromtxt(run.folder / "monitor.csv", delimiter=",", skip_header=2)[:, 0]
-    assert training["game_steps"].tolist() == [40, 80, 120, 160]  # 16 episodes in 4 games
-    assert training["score"].tolist() == [part.mean() for part in np.split(returns, 4)]
+    assert training["game_steps"].tolist() == [40, 80]  # 8 episodes in 4 games
+    assert training["score"].tolist() == [part.mean() for part in np.split(returns, 2)]
     columns = ["game_steps", "score", "episodes"]
-    of_monitor = training_curve(run.folder, 4)[columns].astype(float)
+    of_monitor = training_curve(run.folder, 2)[columns].astype(float)
     pd.testing.assert_frame_equal(of_monitor, training[columns])
 
 

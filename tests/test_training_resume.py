@@ -17,7 +17,7 @@ from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
 OPTIONS = (
-    *("--env", ENV, "--size", "smoke", "-n", "200"),
+    *("--env", ENV, "--size", "smoke", "-n", "120"),
     *("--eval-freq", "10", "--eval-episodes", "2", "--checkpoint-freq", "1", "--inspect-freq", "-1"),
 )
 
@@ -52,7 +52,7 @@ def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
     options = ("--resume", *more)
     train(tmp_path / "undisturbed", algo, "--seed", "3", *options)
     assert "unfinished: a new one begins" in capsys.readouterr().out
-    for evaluation in (2, 3):
+    for evaluation in (1, 2):
         struck(tmp_path / "run", algo, *options, at=evaluation)
     (tmp_path / "run" / algo / f"{ENV}_1" / ".writing-0-best_model.zip").touch()  # as left by SIGKILL
     train(tmp_path / "run", algo, *options, "--checkpoint-freq", "-1")  # writes no more; the seed is the run's
