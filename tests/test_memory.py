@@ -337,7 +337,7 @@ def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tm
 @pytest.mark.parametrize(
     ("method", "memory", "n_episodes", "right"),
     [
-        ("ippo", "lstm", 3_000, True),
+        ("ippo", "lstm", 2_000, True),
         ("qplex", "gru", 3_000, True),
         ("mappo", None, 800, False),
     ],

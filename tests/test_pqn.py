@@ -52,7 +52,7 @@ def test_values_on_policy_do_not_diverge() -> None:
     """VDN diverges on this game from uniform data in a replay buffer (tests/test_qplex.py); its value is 10."""
     env = make_team_env(TwoStates(length=10), n_envs=8, active=False, time_limit="bootstrap")
     model = make_model(env, gamma=0.9, learning_rate=2e-3, td_lambda=0.3, rollout_steps=8, batch_size=32)
-    model.learn(8_000 * 2)
+    model.learn(6_000 * 2)
     actions, _ = model.predict(env.reset(), deterministic=True)
     assert not actions.any()  # both stay where they are paid
     obs: Any = env.step(actions)[0]
@@ -81,12 +81,12 @@ def test_values_of_stored_steps_are_those_of_rows(mixer: Any) -> None:
 
 
 def test_it_learns_team_support() -> None:
-    """A random team collects 1.0 to 1.6 of 6 treasures, and PPO's methods 4 to 5 after as many game steps."""
+    """A random team collects 1.0 to 1.6 of 6 treasures, and this one 5.5 after 8,000 game steps."""
     games: dict[str, Any] = {"n_agents": 3, "grid_size": 8, "n_treasures": 6, "n_keys": 2, "max_cycles": 20}
     env = make_team_env("TeamSupport", n_envs=32, seed=0, **games)
     encoder = {"features_extractor_class": LightEncoder}
     model = PQN("PQNPolicy", env, gamma=0.9, td_lambda=0.65, policy_kwargs=encoder, batch_size=128, seed=0)
-    model.learn(15_000 * env.n_agents)
+    model.learn(8_000 * env.n_agents)
     tests = make_team_env("TeamSupport", n_envs=64, seed=10_000, **games)
     assert evaluate_team(model, tests, 64).mean > 3.5
 
@@ -142,8 +142,18 @@ def test_saved_and_exported_teams_act_alike(tmp_path: Path) -> None:
     obs: Any = telling_env(n_games=16).reset()
     actions, _ = model.predict(obs, deterministic=True)
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], actions)
-    actor = Actor.load(export_actors(model, tmp_path / "actors"))
-    np.testing.assert_array_equal(actor.act(obs["obs"], action_mask=obs["action_mask"]), actions)
+    with th.no_grad():  # so that all actions are somebody's best
+        for parameter in model.policy.actor.parameters():
+            parameter.add_(th.randn_like(parameter))
+    actor, rng = Actor.load(export_actors(model, tmp_path / "actors")), np.random.default_rng(0)
+    chosen = set()
+    for _ in range(20):
+        masks = (rng.random(obs["action_mask"].shape) < 0.5).astype(np.int8)
+        masks[np.arange(len(masks)), rng.integers(masks.shape[1], size=len(masks))] = 1
+        expected = model.predict({"obs": obs["obs"], "action_mask": masks}, deterministic=True)[0]
+        np.testing.assert_array_equal(actor.act(obs["obs"], action_mask=masks), expected)
+        chosen |= set(expected.tolist())
+    assert len(chosen) > 2
 
 
 @pytest.mark.parametrize(
