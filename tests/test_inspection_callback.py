@@ -199,11 +199,9 @@ def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settin
 @pytest.mark.parametrize(
     ("algorithm", "policy", "settings", "expected"),
     [
-        (A2C, "SAFPolicy", {"critic_input": "team"}, {"pool", "knowledge_source", "message"}),
-        (PPO, "SAFPolicy", {"n_policies": 1}, {"knowledge_source", "message"}),
-        (PPO, "SAFPolicy", {"knowledge_source": False}, {"pool"}),
+        (A2C, "SAFPolicy", {"critic_input": "team", "n_policies": 1}, {"knowledge_source", "message"}),
         (PPO, "IPPOPolicy", {}, set()),
-        (MaskablePPO, "SAFMaskablePolicy", {}, {"pool", "knowledge_source", "message"}),
+        (MaskablePPO, "SAFMaskablePolicy", {"knowledge_source": False}, {"pool"}),
     ],
 )
 def test_what_a_policy_lacks_is_left_out(
@@ -339,7 +337,7 @@ class TestMessages:
 # --- QPLEX: values of teams, best actions -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("policy", ["QPLEXPolicy", "QPLEXPoolPolicy", "QPLEXPolicy-gru"])
+@pytest.mark.parametrize("policy", ["QPLEXPoolPolicy", "QPLEXPolicy-gru"])
 def test_the_page_of_qplex(policy: str, tmp_path: Path) -> None:
     callback = InspectionCallback(telling_env(), every_game_steps=20, n_eval_episodes=4)
     make_qplex(telling_env(), policy, gamma=0.5, tensorboard_log=str(tmp_path)).learn(

@@ -258,8 +258,7 @@ def right_arms(model: PPO) -> np.ndarray[Any, Any]:
     return probabilities[agents, agents % Arms.n_actions]
 
 
-@pytest.mark.parametrize("normalize_values", [False, True])
-@pytest.mark.parametrize("policy", ["MAPPO", "IPPO"])
+@pytest.mark.parametrize(("policy", "normalize_values"), [("MAPPO", False), ("IPPO", True)])
 def test_all_agents_learn_whatever_they_are_paid(policy: str, normalize_values: bool) -> None:
     model = make(policy, SCALES, normalize_values).learn(12 * 32 * 4 * len(SCALES))
     assert right_arms(model).min() > 0.9
