@@ -165,14 +165,9 @@ def test_ray_on_this_machine_listens_on_localhost_only_and_knows_its_size() -> N
     assert all(address.rpartition(":")[2].startswith("127.") or address == "::1" for address in addresses), addresses
 
 
-def test_a_job_fails_on_ray(cluster: Any, tmp_path: Path) -> None:
-    (tmp_path / "job.json").write_text("[]")
-    with RayEngine(cluster.address) as engine:
-        error = engine.submit(tmp_path).exception(timeout=200)
-    assert "no job.json of an unfinished cell" in str(error).splitlines()[-1]
-
-
-def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any, tmp_path: Path) -> None:
+def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint_and_a_job_that_is_none_fails(
+    cluster: Any, tmp_path: Path
+) -> None:
     experiment = find_experiment("joint")
     (level, *_) = experiment.tests()
     job = Job(
@@ -195,6 +190,11 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint(cluster: Any,
         time.sleep(1)  # the times are in whole seconds
         second = time.strftime("%Y-%m-%dT%H:%M:%S%z")
         engine.submit(killed).result(timeout=200)
+        no_job = tmp_path / "no job"
+        no_job.mkdir()
+        (no_job / "job.json").write_text("[]")
+        error = engine.submit(no_job).exception(timeout=200)
+    assert "no job.json of an unfinished cell" in str(error).splitlines()[-1]
     assert read_json(killed / "result" / "finished.json")["started"] < second
     assert_same_weights(whole / "result" / "model.zip", killed / "result" / "model.zip")
 

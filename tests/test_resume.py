@@ -158,7 +158,6 @@ MODELS: dict[str, Callable[[], Any]] = {
     "A2C": lambda: make(algorithm=A2C, policy="MAPPOPolicy"),
     "TRPO": lambda: make(algorithm=TRPO, policy="IPPOPolicy", batch_size=ROLLOUT),
     "MaskablePPO": masked,
-    "QPLEX": qplex,
     "QPLEX with memory": lambda: qplex(memory="lstm", sequence_length=4, burn_in=2),
     "PQN": lambda: make(algorithm=PQN, policy="PQNPolicy", rollout_steps=8, batch_size=8),
     "VecNormalize": normalised,

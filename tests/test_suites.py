@@ -180,7 +180,7 @@ def test_a_struck_run_goes_on_bit_for_bit_and_its_team_is_exported_and_inspected
         env = make_team_env(env_id, n_envs=2, seed=5, monitor_dir=str(tmp_path / folder))
         kwargs: dict[str, Any] = {"n_steps": 8, "n_epochs": 2, "rollout_buffer_class": TeamRolloutBuffer}
         model = PPO("SAFPolicy", env, batch_size=8 * env.n_agents, seed=5, **kwargs)
-        total = 80 * env.n_agents
+        total = 48 * env.n_agents
         arguments: dict[str, Any] = {"every_game_steps": 1, "trust_games": True}
         return resumable_learn(model, total, tmp_path / folder, [Lightning(at)], **arguments)
 
