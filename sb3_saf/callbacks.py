@@ -117,7 +117,7 @@ class GameStepsCallback(BaseCallback):
     which count agent steps, and make TensorBoard's x-axis count game steps; log each agent's own return beside the
     team's, ``rollout/ep_rew_mean/AGENT``, but not on the screen. Without teams it does nothing.
 
-    Before training it checks policy, buffer and batch size (:func:`check_training`).
+    Before training it checks the policy (:func:`check_training`).
 
     ``sb3_saf.train`` and ``resumable_learn`` add it automatically; pass it to any other ``learn``.
     """

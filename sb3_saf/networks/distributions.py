@@ -24,6 +24,7 @@ from stable_baselines3.common.distributions import (
     kl_divergence,
     make_proba_distribution,
 )
+from torch import nn
 from torch.distributions import Categorical, Normal, register_kl
 from torch.distributions import Distribution as TorchDistribution
 from torch.nn import functional as F
