@@ -61,7 +61,7 @@ class Scene(NamedTuple):
     :param state: state mapping (``walls``, ``treasures``, ``keys``, ``agent_pos``, ``agent_dir``, ``agent_has_key``)
     :param step: game steps so far in this episode
     :param collected: treasures collected so far in this episode, the team's return
-    :param visible: (N, W, H) bool, the cells that each agent sees, see :func:`seen_cells`; None draws no views
+    :param visible: (N, W, H) bool, the cells that each agent sees (``GameBatch.fields_of_view``); None for no views
     :param selected: index of the agent to mark as the one the person controls
     """
 

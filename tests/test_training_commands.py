@@ -350,7 +350,7 @@ def test_mappings_that_are_given_in_parts_are_merged() -> None:
         (["--gym-packages", "nowhere"], ("--gym-packages: cannot import 'nowhere'",)),
         (["--vec-env", "subproc"], ("n_cpus=2", "TeamTogether-v0")),
         (["-n", "0"], ("--game-steps: must be at least 1, got 0",)),
-        (["-optimize", "--track"], ("--track is for training",)),
+        (["-optimize", "--track", "-tb", "logs"], ("leave out --track, -tb, which training takes",)),
     ],
 )
 def test_mistakes_are_one_line(

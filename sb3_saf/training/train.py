@@ -184,8 +184,10 @@ def _check(options: argparse.Namespace) -> None:
             "--resume is for training with settings, without -optimize and --trial-id; a study goes on by itself when "
             "it is called again, and a trial's settings can be given with -params"
         )
-    if options.optimize_hyperparameters and options.track:
-        raise CommandError("--track is for training: -optimize keeps its trials in the study; leave it out")
+    of_training = {"--track": options.track, "-tb": options.tensorboard_log, "--save-freq": options.save_freq > 0}
+    if options.optimize_hyperparameters and any(of_training.values()):
+        flags = ", ".join(flag for flag, is_given in of_training.items() if is_given)
+        raise CommandError(f"-optimize keeps its trials in the study; leave out {flags}, which training takes")
     model = options.trained_agent
     if model is not None and not (model.suffix == ".zip" and model.is_file()):
         raise CommandError(f"--trained-agent must be a .zip that is there, got {str(model)!r}")
