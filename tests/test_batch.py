@@ -47,7 +47,6 @@ def test_a_game_does_not_depend_on_its_neighbours(task: str, rules: Any) -> None
 
 def test_game_seeds_do_not_depend_on_their_number_and_never_repeat() -> None:
     assert game_seeds(3, 10)[:4] == game_seeds(3, 4)
-    assert game_seeds(3, 4) == game_seeds(3, 6)[:4]
     seeds = [seed for run in range(200) for seed in game_seeds(run, 50)]
     assert len(set(seeds)) == len(seeds)
     assert len(set(game_seeds(0, 100_000))) == 100_000

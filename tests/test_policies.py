@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
 
 from sb3_saf import IPPOPolicy, MAPPOPolicy, SAFPolicy, TeamRolloutBuffer
+from sb3_saf.buffers.rollout import compute_together
 from sb3_saf.networks.layers import Linear, NormalizedReLU, mlp, side_by_side
 from sb3_saf.policies.base import TeamActorCriticPolicy
 from sb3_saf.policies.mappo import JointCritic, MAPPOParts
@@ -528,9 +529,14 @@ def test_values_of_observations_that_were_normalised_above_the_teams() -> None:
         values = model.policy.predict_values(samples.observations)
         th.testing.assert_close(values.flatten(), samples.old_values, rtol=0, atol=1e-5)
     rows = {key: value[[0, 4, 8]] for key, value in team_rows(VECTOR).items()}  # of three games, in the agents' order
-    policy = make_policy(MAPPOPolicy)
-    with th.no_grad():
-        th.testing.assert_close(th.Tensor(policy(rows)[1]), policy.predict_values(rows))
+    for encode_once in (True, False):
+        policy = make_policy(MAPPOPolicy, encode_once=encode_once)
+        policy.set_training_mode(False)
+        with th.no_grad():
+            steps = [policy(part)[1] for part in (rows, team_rows(VECTOR, n_games=1), rows)]
+            known = [policy.predict_values(part) for part in (rows, team_rows(VECTOR, n_games=1), rows)]
+            for found, value in zip(compute_together(steps), known, strict=True):
+                th.testing.assert_close(found, value)
 
 
 def test_with_gumbel_it_is_not() -> None:

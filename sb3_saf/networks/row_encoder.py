@@ -162,8 +162,12 @@ def _joined(parts: Sequence[Rows], counts: Sequence[int]) -> Rows:
     """Concatenate indices, shifted by the start of each part."""
     if all(isinstance(part, InOrder) for part in parts):
         return InOrder((sum(part.shape[0] for part in parts), *parts[0].shape[1:]))
-    starts = accumulate(counts, initial=0)
-    return th.cat([part + start for part, start in zip(cast(Sequence[th.Tensor], parts), starts, strict=False)])
+    (device,) = {part.device for part in parts if not isinstance(part, InOrder)}
+    indices = [  # steps of whole teams, between others
+        th.arange(prod(part.shape), device=device).view(part.shape) if isinstance(part, InOrder) else part
+        for part in parts
+    ]
+    return th.cat([part + start for part, start in zip(indices, accumulate(counts, initial=0), strict=False)])
 
 
 class RowEncoder:

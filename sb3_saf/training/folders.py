@@ -78,9 +78,9 @@ def write_run(
     """
     folder.mkdir(parents=True, exist_ok=True)
     content = {"settings": settings, "seed": seed, "options": options or {}}
-    write_json(folder / RUN_FILE, {**content, "command": command, "versions": software_versions()})
     for name in (FINISHED, CURVE):  # of an earlier run in this folder
         (folder / name).unlink(missing_ok=True)
+    write_json(folder / RUN_FILE, {**content, "command": command, "versions": software_versions()})
 
 
 def finish_run(folder: Path, **cost: Any) -> None:
