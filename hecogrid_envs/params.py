@@ -48,7 +48,7 @@ class HECOGridParams:
     :param heterogeneity: h, number of zones (vertical stripes) with different dynamics; 1 <= h <= grid_size - 2
     :param n_treasures: treasures on the map
     :param n_keys: keys on the map; KeyForTreasure only, other tasks place none
-    :param clutter_density: share of the interior that is wall: ``int(density * (W - 2) * (W - 2))`` cells, W = grid_size
+    :param clutter_density: share of the n x n cells of the interior that are wall: ``int(density * n * n)`` cells
     :param view_size: side of an agent's square view in cells; odd
     :param view_tile_size: pixels per cell in an ``"rgb"`` observation
     :param view_offset: rows visible behind the agent

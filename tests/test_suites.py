@@ -267,6 +267,14 @@ def test_wrapped_games_keep_the_settings_of_their_suite() -> None:
 
 
 @needs("lbf")
+def test_wrapped_games_are_not_compared_with_published_results() -> None:
+    """Wrappers may change rewards, which are then those of the returns."""
+    for overrides, is_known in (({}, True), ({"env_wrapper": "supersuit.clip_reward_v0"}, False)):
+        settings = load_settings("mappo", "lbf/Foraging-8x8-2p-3f-v3", "smoke", overrides=overrides)
+        assert (settings.standing({"return": 0.5}, 1000) is not None) == is_known
+
+
+@needs("lbf")
 def test_foraging_ends_by_its_time_limit_unless_all_food_is_collected() -> None:
     env: Any = find_environment("lbf/Foraging-8x8-2p-3f-v3").make_game({"max_episode_steps": 60})
     env.reset(seed=0)

@@ -6,6 +6,7 @@ import functools
 import multiprocessing
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from gymnasium import spaces
+from gymnasium.utils import EzPickle
 from pettingzoo.utils import parallel_to_aec
 
 from sb3_saf import game_seeds
@@ -388,6 +390,37 @@ def test_what_cannot_be_pickled_stays_in_this_process(bridge: Bridge) -> None:
         venv.close()
         with pytest.raises(ValueError, match=r"n_cpus=2 .* pickling it failed .* use n_cpus=1"):
             bridge(make, n_games=2, n_cpus=2)
+
+
+class Remade(CounterEnv, EzPickle):
+    """Pickles and copies of it have the arguments of its constructor only."""
+
+    def __init__(self) -> None:
+        EzPickle.__init__(self)
+        super().__init__()
+
+    def process_id(self) -> int:
+        return os.getpid()
+
+
+@one_and_two_cpus
+def test_what_was_set_after_the_construction_is_copied(bridge: Bridge, n_cpus: int) -> None:
+    for wrap in (lambda env: env, OuterWrapper):
+        game = Remade()
+        game.max_cycles = 2
+        venv = bridge(wrap(game), n_games=2, n_cpus=n_cpus)
+        venv.reset()
+        assert [venv.step(zeros(venv))[2].all() for _ in range(4)] == [False, True] * 2
+
+
+def test_workers_leave_signals_to_their_owner(bridge: Bridge) -> None:
+    """Ctrl-C in a terminal is sent to all processes: the owner may need the games for a last checkpoint."""
+    venv = bridge(Remade, n_games=2, n_cpus=2)
+    venv.reset()
+    for pid in venv.env_method("process_id"):
+        os.kill(pid, signal.SIGINT)
+        os.kill(pid, signal.SIGTERM)
+    assert venv.step(zeros(venv))[1].tolist() == [10, 11] * 2
 
 
 class OddSpacesEnv(CounterEnv):

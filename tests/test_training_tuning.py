@@ -118,6 +118,7 @@ def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (("--env-kwargs", "coordination:2"), "coordination was 1, now 2"),
         (("--eval-env-kwargs", "coordination:2"), "eval_env_kwargs"),
         (("--eval-episodes", "2"), "eval_episodes was 4, now 2"),
+        (("--n-evaluations", "3"), "n_evaluations was 5, now 3"),
         (("-params", "gamma:0.5"), "gamma"),
         (("-i", str(tmp_path / "model.zip")), "initial_model"),
     ):

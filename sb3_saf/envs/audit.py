@@ -265,7 +265,7 @@ def layers_of(env: Any) -> list[Any]:
         if inner is None:
             break
         layers.append(inner)
-    bare = env.unwrapped
+    bare = getattr(env, "unwrapped", layers[-1])
     return layers if any(layer is bare for layer in layers) else [*layers, bare]
 
 
@@ -276,8 +276,7 @@ def settings_of(env: Any) -> dict[str, Any]:
     :param env: before its first episode; attributes of attributes are followed, of the game and of each of its wrappers
     """
     result: dict[str, Any] = {}
-    layers = layers_of(env) if hasattr(env, "unwrapped") else [env]
-    todo = [(type(layer).__name__, layer, 0) for layer in reversed(layers) if hasattr(layer, "__dict__")]
+    todo = [(type(layer).__name__, layer, 0) for layer in reversed(layers_of(env)) if hasattr(layer, "__dict__")]
     visited = {id(layer) for _, layer, _ in todo}
     while todo:
         name, value, level = todo.pop()

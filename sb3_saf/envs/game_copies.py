@@ -109,21 +109,33 @@ def pickled(game: Any) -> npt.NDArray[np.uint8]:
     """
     Pickle a game and the global random generators of this process, which the game may use.
 
-    Attributes that cannot be pickled (fonts, surfaces, windows) are left out and taken from a new game;
-    :func:`find_way` tests that the game behaves equally.
+    :func:`find_way` tests that the copy behaves equally.
     """
-    try:
-        data = _dump((game, _global_generators()), {})
-    except Exception:
-        data = _dump((game, _global_generators()), _unpicklable(game))
-    return np.frombuffer(data, dtype=np.uint8)
+    return np.frombuffer(packed((game, _global_generators()), game), dtype=np.uint8)
 
 
 def unpickled(data: npt.NDArray[np.uint8], game: Any) -> Any:
     """Unpickle a game and restore the global random generators; only for signed data."""
-    found, generators = _Unpickler(data.tobytes(), game).load()
+    found, generators = unpacked(data.tobytes(), game)
     _set_global_generators(generators)
     return found
+
+
+def packed(data: Any, game: Any) -> bytes:
+    """
+    Pickle data that contain a game, with all that was set after its construction, which its class may leave out.
+
+    Attributes that cannot be pickled (fonts, surfaces, windows) are left out and taken from a new game.
+    """
+    try:
+        return _dump(data, {})
+    except Exception:
+        return _dump(data, _unpicklable(game))
+
+
+def unpacked(data: bytes, game: Any) -> Any:
+    """Unpickle what :func:`packed` returned, with the help of a new game."""
+    return _Unpickler(data, game).load()
 
 
 def _dump(data: Any, left_out: Mapping[int, _Place]) -> bytes:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import io
 import pickle
 import random
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import partial
 from typing import Any, Final, TypeAlias
@@ -21,12 +21,13 @@ import cloudpickle
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium.utils import EzPickle
 from gymnasium.vector.utils import iterate
 from supersuit.vector import ConcatVecEnv, MarkovVectorEnv
 
 from sb3_saf.envs import audit
 from sb3_saf.envs.audit import check_is_parallel
-from sb3_saf.envs.game_copies import Way, find_way, is_found_by_name, pickled, unpickled
+from sb3_saf.envs.game_copies import Way, find_way, is_found_by_name, packed, pickled, unpacked, unpickled
 from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
 from sb3_saf.envs.gymnasium_team import as_parallel
 from sb3_saf.teams.conversion import MASK_NAMES
@@ -236,13 +237,14 @@ def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], A
         (for instance of a local class with ``functools.lru_cache`` on its methods)
     :raises ValueError: if it cannot be copied, with a fix
     """
+    state = None if is_factory else _set_later(make_env)
     try:
         if n_cpus > 1:
             cloudpickle.dumps(make_env)
         file = io.BytesIO()
         classes: dict[int, type] = {}
         _Pickler(file, classes).dump(make_env)
-        return partial(_unpickled_game, file.getvalue(), classes, is_factory)
+        return partial(_unpickled_game, file.getvalue(), classes, is_factory, state)
     except Exception as error:
         if n_cpus > 1:
             raise ValueError(
@@ -251,7 +253,7 @@ def game_factory(make_env: Any, is_factory: bool, n_cpus: int) -> Callable[[], A
                 "function is such a thing), or use n_cpus=1, where nothing is sent"
             ) from error
     make = make_env if is_factory else partial(_copied_game, _copied_game(make_env))
-    return lambda: as_parallel(make())
+    return lambda: as_parallel(_with_state(make(), state))
 
 
 class _Pickler(cloudpickle.Pickler):
@@ -284,14 +286,32 @@ class _Unpickler(pickle.Unpickler):
         return self._classes[pid]
 
 
-def _unpickled_game(pickled_env: bytes, classes: Mapping[int, type], is_factory: bool) -> Any:
+def _unpickled_game(pickled_env: bytes, classes: Mapping[int, type], is_factory: bool, state: bytes | None) -> Any:
     content = _Unpickler(pickled_env, classes).load()
-    return as_parallel(content() if is_factory else content)
+    return as_parallel(content() if is_factory else _with_state(content, state))
+
+
+def _with_state(env: Any, state: bytes | None) -> Any:
+    return env if state is None else unpacked(state, env)
+
+
+def _set_later(env: Any) -> bytes | None:
+    """Return the state of an EzPickle, whose own copies have the arguments of its constructor only; None for others."""
+    if not any(isinstance(layer, EzPickle) for layer in audit.layers_of(env)):
+        return None
+    with _copying(env):
+        return packed(env, env)
 
 
 def _copied_game(env: Any) -> Any:
-    try:
+    with _copying(env):
         return deepcopy(env)
+
+
+@contextmanager
+def _copying(env: Any) -> Iterator[None]:
+    try:
+        yield
     except Exception as error:
         raise ValueError(
             f"each game needs its own copy of {env}, but copying it failed ({error}); "

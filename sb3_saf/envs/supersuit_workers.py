@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import threading
 import time
 import traceback
@@ -49,6 +50,8 @@ class GameProcess(gymnasium.Env[Any, Any]):
     def __init__(self, make_games: Callable[[], TeamConcatVecEnv]) -> None:
         self._make_games = make_games
         self._games: TeamConcatVecEnv | None = None
+        for number in (signal.SIGINT, signal.SIGTERM):  # terminals and clusters signal all processes: the owner decides
+            signal.signal(number, signal.SIG_IGN)
         threading.Thread(target=_end_with_owner, daemon=True).start()
 
     def run(self, payload: bytes) -> bytes:

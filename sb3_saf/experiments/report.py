@@ -48,7 +48,7 @@ from sb3_saf.experiments.tables import (
     strata,
     write_tables,
 )
-from sb3_saf.suites.registry import find_environment, folder_name, standing
+from sb3_saf.suites.registry import find_environment, folder_name
 from sb3_saf.training.commands import option_words
 from sb3_saf.training.figures import TEAM_RETURN, draw_aggregates, draw_curves, draw_differences, draw_levels
 from sb3_saf.training.statistics import (
@@ -344,7 +344,7 @@ def known(content: Content) -> str:
                 won, score, game_steps = results.loc[(*key, level.slug)]
                 settings = content.config.settings(cell, level)
                 scores = {"return": score} if pd.isna(won) else {"won": won, "return": score}
-                beside = standing(settings.environment, settings.env_kwargs, scores, int(game_steps))
+                beside = settings.standing(scores, int(game_steps))
                 if beside is not None:
                     lines.append(f"- {_text(cell.task)}, {_text(level)}, {_name(cell.method)}: {beside.text}")
     return "\n".join(["## Beside known results", "", *lines]) if lines else ""

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.writer import load_weights
 from sb3_saf.inspection.figures import gif
-from sb3_saf.suites.registry import find_environment, standing
+from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 from sb3_saf.training.commands import (
@@ -113,7 +113,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
         saved = SAVED_MODEL.fullmatch(path.name)
         if saved or options.team is not None or (run.folder / FINISHED).exists():
             game_steps = int(saved[1]) if saved else trained.game_steps
-            known = standing(environment, settings.env_kwargs, result.scores, game_steps)
+            known = settings.standing(result.scores, game_steps)
             if known is not None:
                 print(known.text)
     return result

@@ -33,7 +33,7 @@ from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.evaluation import EvaluationResult
 from sb3_saf.export.writer import read_weights
 from sb3_saf.inspection.callback import InspectionCallback
-from sb3_saf.suites.registry import Standing, standing
+from sb3_saf.suites.registry import Standing
 from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import atomic_file, remove_leftovers
 from sb3_saf.teams.randomness import own_randomness
@@ -76,8 +76,7 @@ class SeededEvalCallback(TeamEvalCallback):
         return go_on
 
     def _log(self, result: EvaluationResult) -> None:
-        settings = self._settings
-        self.standing = standing(settings.environment, settings.env_kwargs, result.scores, team_steps(self.model))
+        self.standing = self._settings.standing(result.scores, team_steps(self.model))
         if self.standing is not None and self.standing.share is not None:
             self.logger.record("eval/share_of_published", self.standing.share)
         super()._log(result)

@@ -42,7 +42,7 @@ from sb3_saf.networks.layers import NormalizedReLU
 from sb3_saf.networks.memory import MemoryName
 from sb3_saf.policies.parts import AlgorithmSpec
 from sb3_saf.registration import COMMANDS, DECLARATIONS
-from sb3_saf.suites.registry import HOME, TeamEnvironment, find_environment, suites
+from sb3_saf.suites.registry import HOME, Standing, TeamEnvironment, find_environment, standing, suites
 from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.vec_env import require_n_agents, shares_reward
@@ -129,6 +129,16 @@ class Settings:
         """Treasures of a HECOGrid game, the largest team return; None for other games, whatever their parameters."""
         suite = self.environment.suite
         return None if suite is None or suite.name != HOME else int(self.env_kwargs["n_treasures"])
+
+    def standing(self, scores: Mapping[str, float], game_steps: int) -> Standing | None:
+        """
+        Compare a result with what is known of the games, see :func:`sb3_saf.suites.registry.standing`.
+
+        :return: None also with an ``env_wrapper``, which may change rewards and lengths
+        """
+        if "env_wrapper" in self.wrapping:
+            return None
+        return standing(self.environment, self.env_kwargs, scores, game_steps)
 
     @property
     def total_timesteps(self) -> int:

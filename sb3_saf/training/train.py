@@ -347,7 +347,8 @@ def _tune(options: argparse.Namespace, command: str) -> None:
         options=quiet,
         **{key: getattr(options, key) for key in keys},
     )
-    evaluated = {name: getattr(options, name) for name in ("eval_env_kwargs", "eval_episodes", "deterministic_eval")}
+    names = ("eval_env_kwargs", "eval_episodes", "deterministic_eval", "n_evaluations")  # the k-th ones are compared
+    evaluated = {name: getattr(options, name) for name in names}
     beginning = None if options.trained_agent is None else digest(options.trained_agent)
     goal = plain({**settings.as_dict(), **evaluated, "initial_model": beginning})
     print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
