@@ -142,6 +142,7 @@ def policy_of(kind: Any, n_actions: int = 4, state: Any = None, **kwargs: Any) -
     return kind(telling_spaces(state=state), spaces.Discrete(n_actions), lambda _: 0.0, **kwargs)
 
 
+@pytest.mark.filterwarnings("ignore:.* allows nothing, which training refuses")
 @pytest.mark.parametrize(
     ("make", "message"),
     [

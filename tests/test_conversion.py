@@ -161,7 +161,7 @@ def test_actions_are_those_of_the_rows(kind: str, masks: str | None, tmp_path: P
             if masks != "info":
                 alone, _ = model.predict({agent: observations[agent]}, deterministic=True)
                 np.testing.assert_allclose(alone[agent], action, atol=1e-6)
-                if kind == "ambiguous" and agent != "c":
+                if kind == "ambiguous" and agent != "c" and masks is None:  # masks have the lengths of the actions
                     with pytest.raises(ValueError, match=r"name the agent: \{'agent': observation\}"):
                         model.predict(observations[agent])
                     continue

@@ -517,12 +517,61 @@ def test_respawned_agents_are_named() -> None:
         def change(self, out: list[Any]) -> None:
             out[2]["a"] = self.t == 1
 
-    env = make_team_env(Respawning)
+    env: Any = None
+    for make in (check_team_env, make_team_env):
+        with pytest.warns(UserWarning, match="a has ended and is in agents again in step 2 of a trial episode"):
+            env = make(Respawning)
     env.reset()
     env.step(np.zeros(2, int))
     with pytest.warns(UserWarning, match="a has ended and is in agents again in game 0 at step 2"):
         env.step(np.zeros(2, int))
     env.step(np.zeros(2, int))  # once: warnings are errors
+
+
+def test_masks_that_allow_nothing_are_named() -> None:
+    class Stuck(Game):
+        def info(self, agent: Any) -> dict[str, Any]:
+            return {"action_mask": np.ones(3, np.int8) * (agent == "a" or self.t != 2)}
+
+    with pytest.warns(UserWarning, match="'action_mask' in the info of b in step 2 of a trial episode allows nothing"):
+        check_team_env(Stuck())
+
+
+def test_parts_of_one_name_have_one_place_for_all_agents() -> None:
+    """Whatever their sizes, their order, and what else an agent sees; integers alone are divided by their bounds."""
+
+    class Depot(Game):
+        parts: Any = {
+            "a": spaces.Dict({"load": spaces.Discrete(2), "parcels": spaces.Box(0, 50, (2,), np.int64), "place": BOX}),
+            "b": spaces.Dict({"load": spaces.Discrete(4), "place": BOX, "parcels": spaces.Box(0, 50, (2,), np.int64)}),
+            "c": spaces.Dict({"lamp": spaces.MultiBinary(1), "place": BOX}),
+        }
+        possible_agents = ("a", "b", "c")
+
+        def observation_space(self, agent: Any) -> spaces.Space[Any]:
+            return self.parts[agent]
+
+        def see(self, agent: Any) -> Any:
+            seen: dict[str, Any] = {
+                "load": 1,
+                "parcels": np.array([20, 3]),
+                "place": np.array([0.5, 0.25]),
+                "lamp": np.ones(1, np.int8),
+            }
+            return {key: seen[key] for key in self.parts[agent].spaces}
+
+    env = make_team_env(Depot, n_envs=1, seed=0)
+    own = env.reset()["obs"]
+    assert own.tolist() == [
+        [0, 1, 0, 0, 20, 3, 0.5, 0.25, 0],
+        [0, 1, 0, 0, 20, 3, 0.5, 0.25, 0],
+        [0, 0, 0, 0, 0, 0, 0.5, 0.25, 1],
+    ]
+    policy: Any = PPO("MAPPOPolicy", env, n_steps=8, batch_size=24, rollout_buffer_class=TeamRolloutBuffer).policy
+    assert policy.features_extractor.encoder.divisor.tolist() == [1, 1, 1, 1, 50, 50, 1, 1, 1]
+    seen, _ = Depot().reset()
+    actions, _ = policy.predict(seen, deterministic=True)
+    assert list(actions.values()) == policy.predict(env.reset(), deterministic=True)[0].tolist()
 
 
 # --- seeds, statistics, names, types ----------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import os
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from math import isfinite, isnan
 from typing import Any, Final
@@ -21,7 +21,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from sb3_saf.envs.gymnasium_team import ALL, as_parallel
 from sb3_saf.teams.conversion import MASK_NAMES, checked_mask, innermost, leaves_of, mask_in, read_leaves
 from sb3_saf.teams.randomness import own_randomness
-from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, n_mask_entries
+from sb3_saf.teams.rows import ACTION_MASK_KEY, FIXED_SHAPE, allows_nothing, n_mask_entries
 
 #: Steps of a trial, and its limit in seconds.
 TRIAL_STEPS: Final = 30
@@ -57,10 +57,10 @@ def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None
     check_is_parallel(game, is_factory=False)
     trial = Trial(game)
     trial.play(n_steps, seconds)
-    if trial.error is not None:
-        raise trial.error
     for note in trial.notes:
         warnings.warn(note, UserWarning, stacklevel=2)
+    if trial.error is not None:
+        raise trial.error
 
 
 class Trial:
@@ -163,6 +163,9 @@ class Trial:
                 for name, flags in (("terminations", terminations), ("truncations", truncations)):
                     ended |= {agent for agent in listed if end_of(name, flags, agent, self._place)}
                 playing = self._playing(ended)
+                respawned = respawned_agents(self.env, ended, terminations, truncations)
+                if respawned and not any(note.endswith(RESPAWNED) for note in self.notes):
+                    self._note(f"{respawned[0]} has ended and is in agents again {self._place}, {RESPAWNED}")
 
     def _called(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call the game; return None if it fails."""
@@ -217,9 +220,14 @@ class Trial:
 
     def _check_mask(self, agent: Any, key: Any, mask: Any, where: str) -> None:
         try:
-            checked_mask(mask, n_mask_entries(self.actions[agent]) or 0)
+            flags = checked_mask(mask, n_mask_entries(self.actions[agent]) or 0)
         except ValueError as error:
             raise mask_error(error, key, f"the {where} of {agent} {self._place}") from None
+        if allows_nothing(flags[np.newaxis], self.actions[agent])[0]:
+            self._note(
+                f"{key!r} in the {where} of {agent} {self._place} allows nothing, which training refuses: agents that "
+                "have to wait need an action that does nothing"
+            )
 
     def _legal_actions(
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], playing: Sequence[Any]
@@ -246,6 +254,21 @@ def legal_sample(space: spaces.Space[Any], mask: Any) -> Any:
         off, on = flags.reshape(-1, 2).astype(bool).T
         return np.where(off & on, space.sample(), on).astype(space.dtype)
     return space.sample(mask=flags)
+
+
+#: What is said of agents that have ended and play again.
+RESPAWNED: Final = (
+    "not ended any more: an agent that has ended stays out until its team's episode ends. Let agents that will return "
+    "leave agents without an end: they wait, and play on"
+)
+
+
+def respawned_agents(
+    env: Any, ended: Collection[Any], terminations: Mapping[Any, Any], truncations: Mapping[Any, Any]
+) -> list[Any]:
+    """Return the agents that have ended before this step and play in it."""
+    playing = [agent for agent in env.agents if not terminations.get(agent, True) and not truncations.get(agent)]
+    return [agent for agent in playing if agent in ended]
 
 
 class FormError(ValueError):

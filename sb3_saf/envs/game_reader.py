@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
@@ -13,7 +13,7 @@ from pettingzoo import ParallelEnv
 
 from sb3_saf.envs.audit import Trial, mask_error, observation_of, without_mask
 from sb3_saf.networks.encoders import Part, PartsSpace, has_pictures, picture_of, wide_integers
-from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion, Leaf, innermost, padded
+from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion, Key, Leaf, innermost, padded
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -88,7 +88,9 @@ class GameReader:
         has_masks, needs_mask = self._find_masks(trial, action_masks)
         #: By agent: how its observations, masks and actions become those of rows, and back.
         self.conversions = {
-            agent: AgentConversion.of(space, acted[agent], own, self.action_space, keys[agent], agent in needs_mask)
+            agent: AgentConversion.of(
+                space, acted[agent], own, self.action_space, keys[agent], agent in needs_mask, slots_of(own_spaces)
+            )
             for agent, space in zip(self.agents, own_spaces, strict=True)
         }
         #: Whether to warn of masks that come after the trial.
@@ -224,20 +226,18 @@ def own_space(observed: Sequence[spaces.Space[Any]]) -> spaces.Space[Any]:
 
     Equal spaces of fixed shape stay, counted from 0, as Stable-Baselines3 encodes and samples them whatever their
     start. Boxes with equal numbers of axes are padded to the largest; all others become vectors, as
-    ``gymnasium.spaces.flatten_space`` makes them. float64 becomes float32, which networks read.
+    ``gymnasium.spaces.flatten_space`` makes them, in which parts of one name have one place, for all agents.
+    float64 becomes float32, which networks read.
     """
-    first = observed[0]
-    are_equal = all(space == first for space in observed)
-    if isinstance(first, FIXED_SHAPE) and are_equal:
+    own: spaces.Space[Any]
+    first, slots = observed[0], slots_of(observed)
+    if slots is not None:
+        vectors = [_flat_space(space, slots) for space in observed]
+        own = vectors[0] if all(vector == vectors[0] for vector in vectors) else _common_vector(vectors)
+    elif all(space == first for space in observed):
         own = _counted_from_zero(first)
-    elif (
-        all(isinstance(space, spaces.Box) for space in observed)
-        and len({len(space.shape or ()) for space in observed}) == 1
-    ):
-        own = _common_vector(observed) if len(first.shape or ()) == 1 else _common_box(observed)
     else:
-        vectors = [_flat_space(space) for space in observed]
-        own = vectors[0] if are_equal else _common_vector(vectors)
+        own = _common_vector(observed) if len(first.shape or ()) == 1 else _common_box(observed)
     if isinstance(own, spaces.Box) and own.dtype == np.float64:
         with np.errstate(over="ignore"):
             return spaces.Box(own.low.astype(np.float32), own.high.astype(np.float32), dtype=np.float32)
@@ -252,18 +252,37 @@ def _counted_from_zero(space: spaces.Space[Any]) -> spaces.Space[Any]:
     return space
 
 
-def _flat_space(space: spaces.Space[Any]) -> spaces.Box:
+def slots_of(observed: Sequence[spaces.Space[Any]]) -> dict[tuple[Key, ...], range] | None:
+    """Return where rows that are vectors have the parts of Dicts and Tuples; None where they have the game's form."""
+    first = observed[0]
+    are_boxes = all(isinstance(space, spaces.Box) for space in observed)
+    if are_boxes and len({len(space.shape or ()) for space in observed}) == 1:
+        return None
+    if isinstance(first, FIXED_SHAPE) and all(space == first for space in observed):
+        return None
+    sizes: dict[tuple[Key, ...], int] = {}
+    for space in observed:
+        for path, leaf in innermost(space):
+            sizes[path] = max(sizes.get(path, 0), spaces.flatdim(leaf))
+    ends = accumulate(sizes.values())
+    return {path: range(end - size, end) for (path, size), end in zip(sizes.items(), ends, strict=True)}
+
+
+def _flat_space(space: spaces.Space[Any], slots: Mapping[tuple[Key, ...], range]) -> spaces.Box:
     """Return the space of the vector of a Dict or a Tuple; pictures in it stay known to encoders."""
-    flat = spaces.flatten_space(space)
-    assert isinstance(flat, spaces.Box)
-    leaves = [leaf for _, leaf in innermost(space)]
-    slices = pairwise(accumulate(map(spaces.flatdim, leaves), initial=0))
-    boxes = [Part(*ends, leaf) for ends, leaf in zip(slices, leaves, strict=True) if isinstance(leaf, spaces.Box)]
-    pictures = tuple(part for part in boxes if _is_picture(part.space))
-    whole = np.zeros(flat.shape, dtype=np.bool_)
-    for part in boxes:
-        whole[part.start : part.stop] = wide_integers(part.space).reshape(-1)
-    return _with_parts(flat, pictures, whole)
+    n_entries, dtype = max(slot.stop for slot in slots.values()), spaces.flatten_space(space).dtype
+    low, high, whole = np.zeros(n_entries, dtype), np.zeros(n_entries, dtype), np.zeros(n_entries, np.bool_)
+    pictures = []
+    for path, leaf in innermost(space):
+        start, flat = slots[path].start, spaces.flatten_space(leaf)
+        assert isinstance(flat, spaces.Box)
+        stop = start + len(flat.low)
+        low[start:stop], high[start:stop] = flat.low, flat.high
+        if isinstance(leaf, spaces.Box):
+            whole[start:stop] = wide_integers(leaf).reshape(-1)
+            if _is_picture(leaf):
+                pictures.append(Part(start, stop, leaf))
+    return _with_parts(spaces.Box(low, high, dtype=low.dtype.type), tuple(pictures), whole)
 
 
 def _common_box(boxes: Sequence[Any]) -> spaces.Box:

@@ -164,13 +164,9 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
     def _note_respawned(self, terminations: Mapping[Any, Any], truncations: Mapping[Any, Any]) -> None:
         """Warn of agents that have ended and play again."""
-        for agent in self._ended.intersection(self.par_env.agents):
-            if not self._notes and not terminations.get(agent, True) and not truncations.get(agent):
-                self._notes.append(
-                    f"{agent} has ended and is in agents again {self._place}, not ended any more: an agent that has "
-                    "ended stays out until its team's episode ends. Let agents that will return leave agents without "
-                    "an end: they wait, and play on"
-                )
+        respawned = audit.respawned_agents(self.par_env, self._ended, terminations, truncations)
+        if respawned and not self._notes:
+            self._notes.append(f"{respawned[0]} has ended and is in agents again {self._place}, {audit.RESPAWNED}")
 
     def _infos(
         self, infos: Mapping[Any, Any], acted: Container[Any], reserved: frozenset[str] = RESERVED_KEYS

@@ -139,9 +139,10 @@ class TeamPolicy(RememberingPolicy):
                 )
             warnings.warn(
                 f"{type(self).__name__} is trained on minibatches of SB3's own rollout buffer, which stores each "
-                "observation once more for every agent and splits teams: slower, with the same result. Train with "
-                "rollout_buffer_class=sb3_saf.TeamRolloutBuffer; PPO(policy, env, **sb3_saf.ppo_settings(env)) sets "
-                "it, with a batch size of whole teams instead of SB3's 64 rows",
+                "observation once more for every agent and splits teams: slower, with the same result where all agents "
+                "always take part. Train with rollout_buffer_class=sb3_saf.TeamRolloutBuffer (in a YAML file: "
+                "rollout_buffer_class: TeamRolloutBuffer); PPO(policy, env, **sb3_saf.ppo_settings(env)) sets it, with "
+                "a batch size of whole teams instead of SB3's 64 rows",
                 UserWarning,
                 stacklevel=5,
             )

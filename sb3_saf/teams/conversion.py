@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from math import prod
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
@@ -199,6 +200,7 @@ class AgentConversion:
 
     :param leaves: arrays of its observation in the game, in the order in which rows have them
     :param is_flat: whether rows have them as one vector
+    :param starts: their first entries in that vector, with zeros between them; empty if one follows the other
     :param shape: shape of a row's own observation; smaller ones are padded with zeros at the end of each axis
     :param channels_last: whether the game's pictures have channels last, and rows have them first
     :param mask_key: key of the mask in observations of the game that have one
@@ -214,6 +216,7 @@ class AgentConversion:
     channels_last: bool = False
     mask_key: str | None = None
     needs_mask: bool = False
+    starts: tuple[int, ...] = ()
 
     @classmethod
     def of(
@@ -224,26 +227,30 @@ class AgentConversion:
         row_actions: spaces.Space[Any],
         mask_key: str | None = None,
         needs_mask: bool = False,
+        slots: Mapping[tuple[Key, ...], range] | None = None,
     ) -> AgentConversion:
         """
         Describe the conversion between spaces of the game and of rows; ``observation_space`` is without masks.
 
         :param own: space of a row's own observation
         :param row_actions: action space of rows
+        :param slots: where rows that are vectors have the parts of observations, by path; None for the game's form
         """
         from gymnasium import spaces
 
-        shape = tuple(own.shape or ())
-        is_own_form = isinstance(observation_space, type(own)) and len(observation_space.shape or ()) == len(shape)
+        leaves, shape = tuple(leaves_of(observation_space)), tuple(own.shape or ())
+        starts = () if slots is None else tuple(slots[leaf.path].start for leaf in leaves)
+        sizes = [spaces.flatdim(part) for _, part in innermost(observation_space)]
         return cls(
-            tuple(leaves_of(observation_space)),
-            isinstance(own, spaces.Box) and not is_own_form,
+            leaves,
+            slots is not None,
             shape,
             str(own.dtype),
             Leaf.of(action_space),
             Leaf.of(row_actions),
             mask_key=mask_key,
             needs_mask=needs_mask,
+            starts=() if starts == (0, *accumulate(sizes[:-1])) else starts,
         )
 
     @classmethod
@@ -281,7 +288,12 @@ class AgentConversion:
         """
         arrays = read_leaves(self.leaves, observation)
         if self.is_flat:
-            array = np.concatenate([leaf.flat(one) for leaf, one in zip(self.leaves, arrays, strict=True)])
+            parts = [leaf.flat(one) for leaf, one in zip(self.leaves, arrays, strict=True)]
+            array = np.concatenate(parts)
+            if self.starts:
+                array = np.zeros(self.shape, array.dtype)
+                for start, part in zip(self.starts, parts, strict=True):
+                    array[start : start + len(part)] = part
         else:
             array = np.moveaxis(arrays[0], -1, 0) if self.channels_last else arrays[0]
         if array.shape != self.shape:
@@ -347,8 +359,11 @@ class AgentConversion:
 
     def fits(self, observation: Any) -> bool:
         """Return whether an observation has the form of the agent's in the game, with or without mask."""
+        own, mask = self.split(observation)
         try:
-            self.own(self.split(observation)[0])
+            self.own(own)
+            if mask is not None:
+                self.mask(mask)
         except ValueError:
             return False
         return True
@@ -485,10 +500,10 @@ def given_by_game(
     if any(conversions[index] != kind for index in fitting):
         if isinstance(observation, np.ndarray) and observation.shape == team.own_shape:
             return None
-        name = 0 if names is None else names[fitting[0]]
+        known_by = fitting if names is None else [names[index] for index in fitting]
         raise ValueError(
-            f"expected to know whose observation this is, which several kinds of agents have; name the agent: "
-            f"{{{name!r}: observation}}"
+            f"expected to know whose observation this is: it may be one of {', '.join(map(repr, known_by))}; name "
+            f"the agent: {{{known_by[0]!r}: observation}}"
         )
     index = fitting if len(fitting) == 1 else None
     return _given(team, [observation], [action_masks], [kind], index, None, takes_masks)
