@@ -363,7 +363,7 @@ class AgentConversion:
         try:
             self.own(own)
             if mask is not None:
-                self.mask(mask)
+                checked_mask(mask, sum(self.action.choices))
         except ValueError:
             return False
         return True
