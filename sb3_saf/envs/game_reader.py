@@ -86,10 +86,11 @@ class GameReader:
         #: Action space of a row.
         self.action_space = common_actions(acted)
         has_masks, needs_mask = self._find_masks(trial, action_masks)
+        slots = slots_of(own_spaces)
         #: By agent: how its observations, masks and actions become those of rows, and back.
         self.conversions = {
             agent: AgentConversion.of(
-                space, acted[agent], own, self.action_space, keys[agent], agent in needs_mask, slots_of(own_spaces)
+                space, acted[agent], own, self.action_space, keys[agent], agent in needs_mask, slots
             )
             for agent, space in zip(self.agents, own_spaces, strict=True)
         }
