@@ -202,7 +202,7 @@ class RayEngine(Engine):
 
 
 def inputs_of(folder: Path) -> dict[str, bytes]:
-    """Return the files that a node needs for a job: the job, and the models of a cell that only is to be tested."""
+    """Return the files that a node needs for a job: the job, and the models of a trained cell that is to be tested."""
     return {path.name: path.read_bytes() for path in (folder / "job.json", *folder.glob("*.zip"))}
 
 

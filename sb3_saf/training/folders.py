@@ -70,7 +70,7 @@ def write_run(
     folder: Path, settings: Mapping[str, Any], seed: int, command: str, options: Mapping[str, Any] | None = None
 ) -> None:
     """
-    Write what determines a run, before it begins.
+    Write what determines a run, before it begins, and remove the end of an earlier run in the folder.
 
     :param settings: from :meth:`Settings.as_dict`
     :param command: the command line that makes this run
