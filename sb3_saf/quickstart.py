@@ -73,7 +73,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ValueError as error:
         parser.error(str(error))
     seed, output = options.seed, options.output
-    output.mkdir(parents=True, exist_ok=True)
     words = sys.argv[1:] if arguments is None else arguments
     write_run(output, settings.as_dict(), seed, shlex.join(["python", "-m", "sb3_saf.quickstart", *words]))
     title = f"{options.task}, coordination {options.coordination}, heterogeneity {options.heterogeneity}"

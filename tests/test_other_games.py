@@ -610,8 +610,11 @@ def test_a_game_that_ignores_its_seed_is_named(draws: bool) -> None:
     if draws:
         with pytest.warns(UserWarning, match=r"ignore reset\(seed"):
             env.step(np.zeros(4, int))
+        with pytest.warns(UserWarning, match="first observations of a differ in two resets with the seed 0"):
+            check_team_env(Stubborn())
     else:
         env.step(np.zeros(4, int))  # a game without chance: warnings are errors
+        check_team_env(Stubborn())
 
 
 def test_statistics_of_observations_leave_out_the_dead() -> None:

@@ -19,7 +19,7 @@ from sb3_saf import LightEncoder, TeamRolloutBuffer, game_seeds
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.checks import MAX_SEED, evaluation_seed
 from sb3_saf.training.settings import ALGOS, load_settings, saved_settings
-from sb3_saf.training.yaml_files import SIZES, Size, config_names, read_settings
+from sb3_saf.training.yaml_files import SIZES, Size, config_names, load_yaml, read_settings
 
 ENV = "TeamTogether-v0"
 ENV_IDS = suites()["hecogrid"].tasks
@@ -127,6 +127,10 @@ def test_what_is_given_wins_and_policy_kwargs_are_merged() -> None:
     assert (settings.env_kwargs["coordination"], settings.env_kwargs["grid_size"]) == (2, 15)
     other = load_settings("saf", ENV, "smoke", overrides={"batch_size": 500, "time_limit": "bootstrap"})
     assert other.hyperparams["batch_size"] == 500 and other.make_env(0).time_limit == "bootstrap"
+
+
+def test_numbers_with_exponents_are_no_text() -> None:
+    assert load_yaml("[1e-3, -2.E4, .5e+1, lin_1e-3, '1e-3', 1e]", "x") == [0.001, -2e4, 5.0, "lin_1e-3", "1e-3", "1e"]
 
 
 @pytest.mark.parametrize("algorithm", ["A2C", "TRPO"])

@@ -96,7 +96,6 @@ class CheckpointFolder:
         """
         target = self.path / f"checkpoint-{game_steps:012d}.ckpt"
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
             remove_leftovers(self.path)
             with atomic_file(target) as file:
                 content(file)

@@ -44,7 +44,7 @@ def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None
     Check that a game gives what ``make_team_env`` needs, by playing random legal actions, as SB3's ``check_env`` does.
 
     Agents, spaces, observations, rewards, ends, infos and action masks are checked until the first episode ends.
-    ``make_team_env`` does the same for 30 steps, on a copy of the game.
+    ``make_team_env`` does the same for 30 steps, on a copy of the game. Then two resets with one seed are compared.
 
     :param env: PettingZoo ParallelEnv or Gymnasium environment of several agents, which is reset and played, or a
         function that makes one
@@ -57,6 +57,8 @@ def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None
     check_is_parallel(game, is_factory=False)
     trial = Trial(game)
     trial.play(n_steps, seconds)
+    if trial.error is None:
+        trial.check_seed()
     for note in trial.notes:
         warnings.warn(note, UserWarning, stacklevel=2)
     if trial.error is not None:
@@ -166,6 +168,18 @@ class Trial:
                 respawned = respawned_agents(self.env, ended, terminations, truncations)
                 if respawned and not any(note.endswith(RESPAWNED) for note in self.notes):
                     self._note(f"{respawned[0]} has ended and is in agents again {self._place}, {RESPAWNED}")
+
+    def check_seed(self) -> None:
+        """Note that first observations differ in two resets with one seed."""
+        with own_randomness(0, th.device("cpu")):
+            results = [self._called(reset, self.env, 0, None) for _ in range(2)]
+        for agent in () if None in results else self._playing(frozenset()):
+            seen = [read_leaves(self._leaves[agent], observations[agent]) for observations, _ in results]
+            if not all(map(np.array_equal, *seen)):
+                return self._note(
+                    f"first observations of {agent} differ in two resets with the seed 0: draw from reset's seed, so "
+                    "that evaluations play the same games again and runs can be repeated"
+                )
 
     def _called(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call the game; return None if it fails."""

@@ -155,7 +155,6 @@ class Results:
 
     def save_config(self, config: RunConfig) -> None:
         """Write the configuration of the folder's cells, unless it exists."""
-        self.folder.mkdir(parents=True, exist_ok=True)
         if self.config() is None:
             write_json(self.folder / "settings.json", asdict(config))
 
@@ -248,7 +247,6 @@ class Results:
     def add_selection(self, experiment: Experiment, selection: Selection) -> None:
         """Store a requested selection."""
         folder = self.folder / experiment.name / "selections"
-        folder.mkdir(parents=True, exist_ok=True)
         if experiment.name not in EXPERIMENTS:
             write_json(folder.parent / "experiment.json", _own(experiment))
         content = plain(asdict(selection))

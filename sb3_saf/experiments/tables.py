@@ -262,7 +262,6 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
         source, team = Run(folder / "cells" / row["cell"]), target / name
         check_runs_no_code(source.description["settings"], source.folder)
         shutil.rmtree(team, ignore_errors=True)
-        team.mkdir(parents=True)
         with closing(source.settings.make_env(source.seed, evaluation=True, n_envs=1)) as games:
             save_weights(make_policy(source.settings, source.folder / BEST_MODEL, games), team / WEIGHTS)
         returns = read_json(source.folder / "tests" / f"{row['level']}.json")["plays"][0]["returns"]

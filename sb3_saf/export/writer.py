@@ -100,7 +100,6 @@ def export_actors(model: BaseAlgorithm | ExportablePolicy, folder: str | PathLik
     graph = _written(network, inputs, {"sb3_saf": json.dumps(_description(policy, network))})
     _check(graph, network, policy, inputs)
     path = Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
     with atomic_file(path / "actor.onnx") as file:
         file.write(graph)
     # act.py with the code that it imports from this package.

@@ -25,6 +25,7 @@ from sb3_saf.evaluation import check_trained_on
 from sb3_saf.inspection.figures import png
 from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
 from sb3_saf.teams.checks import check_count
+from sb3_saf.teams.files import write_text
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents
 
@@ -138,10 +139,8 @@ def replay(
         ("{{data}}", json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")),
     ):
         page = page.replace(mark, content)
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(page, encoding="utf-8")
-    return target
+    write_text(Path(path), page)
+    return Path(path)
 
 
 def _outputs(recording: EpisodeRecording, game: int, rows: slice, steps: slice) -> Packed:

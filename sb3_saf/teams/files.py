@@ -38,18 +38,22 @@ def atomic_file(path: Path) -> Iterator[BufferedWriter]:
     """
     Open a temporary file that replaces a file when it is complete and on disk; after an error the old one is kept.
 
+    Missing folders are made.
+
     :param path: the file, of any writer that takes an open file, such as SB3's ``model.save``
     :raises OSError: with the path, for instance if the disk is full
     """
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex[:12]}-{path.name}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         reason = error.__context__ if isinstance(error, RuntimeError) else error  # torch hides a full disk
         if isinstance(reason, OSError):
             number = reason.errno or errno.EIO

@@ -76,7 +76,6 @@ def write_run(
     :param command: the command line that makes this run
     :param options: what else affects its results
     """
-    folder.mkdir(parents=True, exist_ok=True)
     content = {"settings": settings, "seed": seed, "options": options or {}}
     for name in (FINISHED, CURVE):  # of an earlier run in this folder
         (folder / name).unlink(missing_ok=True)

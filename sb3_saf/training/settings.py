@@ -433,8 +433,7 @@ def convert(name: str, value: object, hint: Any) -> Any:
     """
     Convert a plain value to a constructor argument.
 
-    Numbers may be text, since YAML 1.1 reads ``7e-4`` as text. ``lin_0.001`` is RL-Zoo3's schedule, linear from 0.001
-    to 0.
+    ``lin_0.001`` is RL-Zoo3's schedule, linear from 0.001 to 0.
 
     :param name: the argument's name, which selects its classes and its range
     :param value: value from YAML or a command line; classes and functions are returned unchanged

@@ -18,7 +18,7 @@ from typing import Any, Final
 import yaml
 
 from sb3_saf.teams.checks import MAX_SEED, CheckpointError, NonFiniteError, SettingsError, check_seed
-from sb3_saf.teams.files import digest, plain
+from sb3_saf.teams.files import digest, plain, write_text
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -359,10 +359,9 @@ def _tune(options: argparse.Namespace, command: str) -> None:
             command,
             goal,
         )
-        folder = options.log_folder / settings.algo
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"report_{settings.environment.folder_name}_{int(time.time())}.csv"
-        study.trials_dataframe().to_csv(path)
+        report = f"report_{settings.environment.folder_name}_{int(time.time())}.csv"
+        path = options.log_folder / settings.algo / report
+        write_text(path, study.trials_dataframe().to_csv())
         best = study.best_trial
     print(f"{len(study.trials)} trials, in {path}\nBest: trial {best.number} with a team return of {best.value:.2f}")
     for key, value in best.params.items():

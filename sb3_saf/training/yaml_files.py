@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from collections.abc import Hashable, Mapping, Sequence
 from copy import deepcopy
@@ -27,7 +28,10 @@ MERGED: Final = ("env_kwargs", "policy_kwargs")
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """PyYAML's safe loader without keys that it misreads: duplicates, and ``key:value`` in braces without a space."""
+    """
+    PyYAML's safe loader without what it misreads: duplicate keys, ``key:value`` in braces without a space, and numbers
+    as ``1e-3``, which YAML 1.1 takes for text.
+    """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         for key, value in node.value if node.flow_style else ():
@@ -42,6 +46,10 @@ class _StrictLoader(yaml.SafeLoader):
                     "while reading a mapping", node.start_mark, f"the key {key!r} is there twice", node.start_mark
                 )
         return super().construct_mapping(node, deep)
+
+
+_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$")
+_StrictLoader.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+.0123456789"))
 
 
 def load_yaml(text: str, source: str) -> Any:
