@@ -446,6 +446,8 @@ def test_predict_needs_the_mask_and_at_least_one_legal_action() -> None:
     for incomplete in (obs["obs"], {"obs": obs["obs"]}):
         with pytest.raises(ValueError, match=r"expected 'action_mask' beside 'obs'.*pass \{'obs': ..., 'action_mask'"):
             policy.predict(incomplete)
+    with pytest.raises(ValueError, match="masks of actions in the rows"):
+        policy.predict(own, action_masks=own["action_mask"])
     own["action_mask"][5] = 0
     with pytest.raises(ValueError, match="at least one legal action in each 'action_mask', got none in row 5 of 18"):
         policy.predict(own)

@@ -7,6 +7,7 @@ import gc
 import multiprocessing
 import pickle
 import random
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -93,6 +94,46 @@ def test_copies_play_on_as_the_games(name: str, n_cpus: int) -> None:
     finally:
         venv.close()
         other.close()
+
+
+class LateEnv(LazyEnv):
+    """Makes a lock after the trial of copies."""
+
+    n_seen, lock = 0, None
+
+    def _observe(self) -> dict[str, Any]:
+        self.n_seen += 1
+        if self.n_seen == 70:
+            self.lock = threading.Lock()
+        return super()._observe()
+
+
+def test_what_a_game_makes_late_does_not_spoil_its_copies() -> None:
+    venv, other = (SuperSuitVecEnv(LateEnv, 1, seed) for seed in (0, 1))
+    venv.reset()
+    played(venv, 72)
+    other.load_checkpoint_state(venv.checkpoint_state())
+    assert played(other, 20) == played(venv, 20)
+
+
+class SharingEnv(CounterEnv):
+    """Draws from a generator of all games of its class."""
+
+    levels = np.random.default_rng(0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.generator = self.levels
+
+    def _observation(self, index: int, draw: np.float32) -> Any:
+        return super()._observation(index, np.float32(self.generator.random()))
+
+
+def test_games_that_share_what_changes_are_not_copied_one_by_one() -> None:
+    venv = SuperSuitVecEnv(SharingEnv, 2, seed=0)
+    venv.reset()
+    with pytest.raises(CheckpointError, match="games share an object that changes"):
+        venv.checkpoint_state()
 
 
 def test_a_slow_game_is_tried_for_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -370,12 +370,22 @@ def test_predict_is_what_the_rollout_did() -> None:
         obs, _, starts, _ = env.step(found)
 
 
+def test_states_of_other_rows_and_masks_that_no_row_has_are_refused() -> None:
+    model, obs = make_model("SAFPolicy", "lstm"), make_env().reset()
+    _, (state,) = model.predict(obs)
+    for wrong in (state[:-1], np.tile(state, (2, 1)), state[:, :8]):
+        with pytest.raises(ValueError, match=r"expected a state of shape \(9, 16\), a row for each observation, got"):
+            model.predict(obs, (wrong,))
+    with pytest.raises(ValueError, match="no action_masks"):
+        model.policy.predict(obs, (state,), action_masks=np.ones((9, 5)))
+
+
 def test_predict_remembers_by_agent() -> None:
     env = make_team_env(DyingGame, 1, seed=0)
     model = make_model("IPPOPolicy", env=env)
     game = DyingGame()
     observations, infos = game.reset(seed=3)
-    state, alone = None, dict[str, Any]()
+    state, alone = dict[str, Any](), dict[str, Any]()
     while observations:
         agents = list(observations)[::-1]
         seen = {

@@ -126,7 +126,17 @@ def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint(monitors: Monitor
     resumed = monitors(2)
     resumed.reset()
     resumed.load_checkpoint_state(state)
-    assert returns_in(tmp_path / "monitor.csv") == [69]
+    path = tmp_path / "monitor.csv"
+    assert returns_in(path) == [69]
+    path.unlink()
+    for _ in range(2):
+        resumed = monitors(2)
+        resumed.reset()
+        with pytest.warns(UserWarning, match="no more episodes are written to it"):
+            resumed.load_checkpoint_state(state)
+        resumed.step(still(resumed))
+        state = resumed.checkpoint_state()
+    assert not path.exists()
 
 
 def test_keywords_that_are_columns_are_refused() -> None:

@@ -13,7 +13,10 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 
 from sb3_saf import QPLEX, Actor, LightEncoder, evaluate_team, export_actors, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
@@ -217,6 +220,33 @@ def test_memory_in_training_is_memory_in_play(kind: str) -> None:
         state = (state[0], samples.actions[t].numpy())  # the actions that were taken
 
 
+def test_agents_that_join_have_no_last_action() -> None:
+    model = make_model(telling_env(1), "QPLEXPolicy-gru", buffer_size=20, batch_size=8)
+    model.learn(20 * 3)
+    samples = model._buffer().sample_sequences(1, 20, 0)
+    assert samples.sequences is not None and samples.now.active is not None
+    none = samples.sequences.resets.unsqueeze(1) | ~samples.now.active.roll(1, 0)
+    assert th.equal(samples.sequences.last_actions < 0, none) and none[:, 2].sum() > none[:, 0].sum()
+
+
+class NormalizedEncoder(BaseFeaturesExtractor):
+    def __init__(self, observation_space: spaces.Box):
+        super().__init__(observation_space, observation_space.shape[0])
+        self.layers = nn.Sequential(nn.BatchNorm1d(self.features_dim), nn.Dropout(0.5))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        return self.layers(x)
+
+
+def test_targets_are_computed_without_dropout_and_by_copied_statistics() -> None:
+    model = make_model(policy_kwargs={"features_extractor_class": NormalizedEncoder}).learn(64 * 3)
+    assert model.policy.features_extractor.training and not model.policy.target_networks.training
+    polyak_update(*model.policy.parameter_pairs(), 1.0)
+    learned, target = (one.encoder.state_dict() for one in (model.policy.online, model.policy.target))
+    name = "layers.0.running_var"
+    assert th.equal(learned[name], target[name]) and not th.equal(target[name], th.ones(3))
+
+
 # --- playing ----------------------------------------------------------------------------------------------------------
 
 
@@ -317,9 +347,14 @@ def test_save_load_and_continue_is_the_run_without_a_break(policy: str, tmp_path
 
 def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
     make_model(toy_env(2)).learn(20 * 3).save_replay_buffer(tmp_path / "buffer")
-    words = "4 games of 3 agents, got TeamReplayBuffer of 6 rows"
-    with pytest.warns(UserWarning, match="unpickled"), pytest.raises(ValueError, match=words):
-        make_model(toy_env(4)).load_replay_buffer(tmp_path / "buffer")
+    for other, words in (
+        (toy_env(4), r"spaces \(12, .*got TeamReplayBuffer of \(6, "),
+        (telling_env(2), "'active'.*got"),
+    ):
+        model = make_model(other)
+        with pytest.warns(UserWarning, match="unpickled"), pytest.raises(ValueError, match=words):
+            model.load_replay_buffer(tmp_path / "buffer")
+        assert model._buffer().n_envs == model.n_envs
 
 
 # --- export; with masks: test_pqn.py ----------------------------------------------------------------------------------
@@ -395,8 +430,10 @@ def test_bad_environments() -> None:
         make_model(ToyTeams(action_space=spaces.Box(-1.0, 1.0, (2,), np.float32)))
     with pytest.raises(ValueError, match="QPLEX needs Discrete actions"):
         make_model(ToyTeams(action_space=spaces.Discrete(3, start=1)))
-    with pytest.raises(ValueError, match="VecNormalize"):
-        make_model(VecNormalize(toy_env(), norm_obs=False))
+    model = make_model()
+    model.set_env(VecNormalize(toy_env(), norm_obs=False))
+    with pytest.raises(ValueError, match="QPLEX does not train on VecNormalize"):
+        model.learn(3)
     with pytest.raises(ValueError, match="expected one of QPLEX's policies"):
         make_model(policy="QPLEXPolice")
 

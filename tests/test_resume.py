@@ -129,9 +129,9 @@ def undisturbed() -> dict[str, bytes]:
     return weights_of(make().learn(WHOLE))
 
 
-def qplex(**parts: Any) -> Any:
+def qplex(train_freq: int = 6, **parts: Any) -> Any:
     """Create QPLEX, whose replay buffer holds half of the run."""
-    settings: dict[str, Any] = {"buffer_size": 48, "learning_starts": 12, "batch_size": 8, "train_freq": 6}
+    settings: dict[str, Any] = {"buffer_size": 48, "learning_starts": 12, "batch_size": 8, "train_freq": train_freq}
     settings |= {"exploration_fraction": 0.9, "target_update_interval": 30}
     return make(algorithm=QPLEX, policy="QPLEXPolicy", policy_kwargs=LIGHT | parts, **settings)
 
@@ -211,6 +211,15 @@ def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
     return [(event.step, event.value) for event in events.Scalars(tag)]
 
 
+def test_tensorboard_may_begin_with_the_resumed_part(tmp_path: Path) -> None:
+    struck(tmp_path / "checkpoints", make(), N_STEPS + 2)
+    model = make()
+    model.tensorboard_log = str(tmp_path / "tb")
+    go_on(tmp_path / "checkpoints", model)
+    (folder,) = (tmp_path / "tb").iterdir()
+    assert "train/loss" in EventAccumulator(str(folder)).Reload().Tags()["scalars"]
+
+
 def test_resume_alone(tmp_path: Path) -> None:
     checkpoints = TeamCheckpointCallback(tmp_path, every_game_steps=1)
     with pytest.raises(RuntimeError):
@@ -286,6 +295,7 @@ CHANGES: dict[str, tuple[Callable[[], Any], Callable[[], Any], str]] = {
     "wrapper": (normalised, lambda: normalised(clip_reward=2.0), "VecNormalize.clip_reward was 10.0, now 2.0"),
     "later stage": (staged(), staged(coordination=2), "Curriculum.stage 1.*coordination was 1, now 2"),
     "length of a stage": (staged(), staged(60), r"Curriculum.ends was \[24, 54\], now \[24, 84\]"),
+    "updates": (qplex, lambda: qplex(train_freq=12), r"model.train_freq was \[6, .*now \[12, "),
     "replay buffer": (qplex, lambda: make(algorithm=QPLEX, policy="QPLEXPolicy"), "buffer_size was 48, now"),
 }
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
 import torch as th
 
+from sb3_saf.checkpoints.learning import CheckpointFolder
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.commands import check_device
 from sb3_saf.training.folders import Run, python_command
-from sb3_saf.training.run import SeededEvalCallback
+from sb3_saf.training.run import SeededEvalCallback, Training
 from tests.kill_harness import results_of
 from tests.test_training_commands import failed
 
@@ -88,7 +90,9 @@ def test_other_settings_begin_another_run(tmp_path: Path) -> None:
     assert Run(run).seed is not None
 
 
-def test_another_initial_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_initial_model_and_a_folder_in_use_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for seed in ("1", "2"):
         train(tmp_path / "models", "saf", "--seed", seed, "-n", "40")
     a, b = (str(tmp_path / "models" / "saf" / f"{ENV}_{number}" / f"{ENV}.zip") for number in (1, 2))
@@ -96,8 +100,16 @@ def test_another_initial_model_is_refused(tmp_path: Path, capsys: pytest.Capture
     for other in (["-i", b], []):
         given = ["--algo", "saf", *OPTIONS, "-f", str(tmp_path), "-tb", str(tmp_path / "tb"), "--resume", *other]
         assert f"began with the model {a}, got " in failed(given, capsys)
-    train(tmp_path, "saf", "--seed", "3", "-i", a, "--resume")
+    run = tmp_path / "saf" / f"{ENV}_1"
+    used = CheckpointFolder(run / "checkpoints")
+    used.acquire()
+    assert "another run writes checkpoints" in failed([*given, "-i", a], capsys)
+    used.release()
+    copy = shutil.copy(a, tmp_path / "copy.zip")
+    train(tmp_path, "saf", "--seed", "3", "-i", str(copy), "--resume")
     assert "Going on with" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="has a finished run"):
+        Training(Run(run).settings, 0, run)
 
 
 def test_nan_stops_the_command_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

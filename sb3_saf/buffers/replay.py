@@ -50,7 +50,7 @@ class Sequences(NamedTuple):
     Order in time of the G steps of a sample: ``n`` sequences of ``length`` steps, one after the other.
 
     :param length: steps of each sequence, burn-in included
-    :param last_actions: (G, N) the agents' actions one step earlier; -1 where an episode starts
+    :param last_actions: (G, N) the agents' actions one step earlier; -1 where an episode starts or an agent joins
     :param resets: (G,) bool, steps before which the memory is reset
     :param counted: (G,) bool, steps that enter the loss
     """
@@ -344,6 +344,8 @@ class TeamReplayBuffer(ReplayBuffer):
         starts = self.starts[slots, games]
         last = self.actions[(slots - 1) % self.n_slots, games].astype(np.int64)
         last[starts] = _NO_ACTION
+        if ACTIVE_KEY in self.seen:  # agents that join
+            last[self.seen[ACTIVE_KEY][(slots - 1) % self.n_slots, games] == 0] = _NO_ACTION
         sequences = Sequences(
             n_sequences,
             len(window),

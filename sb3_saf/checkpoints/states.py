@@ -456,12 +456,12 @@ def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
     """Set a logger that continues in the same folder; a logger set by the caller is kept."""
     if not hasattr(model, "logger"):
         formats = ["stdout"] if model.verbose >= 1 else [""]
-        if state["tensorboard"] is None or model.tensorboard_log is None:
+        if model.tensorboard_log is None:
             model.set_logger(configure(None, formats))
         else:
             from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
-            folder = os.path.join(model.tensorboard_log, os.path.basename(state["tensorboard"]))
+            folder = os.path.join(model.tensorboard_log, os.path.basename(state["tensorboard"] or "resumed"))
             logger, board = configure(folder, formats), TensorBoardOutputFormat(folder)
             logger.output_formats.append(board)
             # TensorBoard hides entries written after the checkpoint, which are written again.

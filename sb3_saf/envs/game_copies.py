@@ -102,7 +102,7 @@ class _Unpickler(pickle.Unpickler):
         self._layers = layers_of(game)
 
     def persistent_load(self, pid: Any) -> Any:
-        return vars(self._layers[pid[0]])[pid[1]]
+        return vars(self._layers[pid[0]]).get(pid[1])  # None for what a game makes later
 
 
 def pickled(game: Any) -> npt.NDArray[np.uint8]:
@@ -249,7 +249,8 @@ def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
     """
     Return a way of copying after which the copy continues like the original.
 
-    A new game plays some steps and is copied; both then play the same actions and begin another episode.
+    A new game plays some steps and is copied; another plays and may change what games share; then both play the same
+    actions and begin another episode.
 
     :raises CheckpointError: if there is no such way, with the difference found
     """
@@ -269,25 +270,29 @@ def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
 
 def _trial(make_game: Callable[[], TeamMarkovVectorEnv], way: Way) -> str | None:
     """Return why a way fails, or None."""
-    original, copy = make_game(), make_game()
+    original, copy, third = (make_game() for _ in range(3))
     try:
-        reason = _difference(original, copy, way)
+        reason = _difference(original, copy, third, way)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
     if reason is not None and way == "pickle":
         left_out = [name for _, name in _unpicklable(original.par_env).values()]
         reason += f" (it has to do without {', '.join(left_out)}, which cannot be pickled)" if left_out else ""
-    for game in (original, copy):
+    for game in (original, copy, third):
         with suppress(Exception):
             game.close()
     return reason
 
 
-def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: Way) -> str | None:
+def _difference(
+    original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, third: TeamMarkovVectorEnv, way: Way
+) -> str | None:
     """Return the first difference between a game and its copy, or None."""
     rows, _ = _play(original, original.reset(seed=0)[0], TRIAL_STEPS)
     copy.restore(decode(encode(original.snapshot(way))))
     began = _global_generators()
+    _play(third, third.reset(seed=1)[0], TRIAL_STEPS)
+    _set_global_generators(began)
     _, seen = _play(original, rows, TRIAL_STEPS)
     seen.append(_bytes_of(original.reset()[0]))
     if way == "pickle":  # includes the global generators
@@ -296,7 +301,10 @@ def _difference(original: TeamMarkovVectorEnv, copy: TeamMarkovVectorEnv, way: W
     seen_by_copy.append(_bytes_of(copy.reset()[0]))
     for step, (one, other) in enumerate(zip(seen, seen_by_copy, strict=True), 1):
         if one != other:
-            return f"{step} steps later a copy differs from the game, as where reset(seed=None) makes a new generator"
+            return (
+                f"{step} steps later a copy differs from the game, as where reset(seed=None) makes a new generator, or "
+                "games share an object that changes"
+            )
     return None
 
 

@@ -232,18 +232,20 @@ class TeamMonitor(TeamVecEnvWrapper):
         self.episode_count = state["episode_count"]
         self.t_start = state["t_start"]
         self._n_steps = state["n_steps"]
-        if self._filename is None or not size:
-            return  # the file is created at the next step
+        if self._filename is None or not self._n_steps:
+            return  # the file is created at the first step
         if self._writer is not None:
             self._writer.close()
-        self._writer = self._open(override_existing=False)
-        assert self._writer is not None
-        if len(kept) == size:
+            self._writer = None
+        if size and len(kept) == size:
+            self._writer = self._open(override_existing=False)
+            assert self._writer is not None
             os.truncate(self._writer.file_handler.fileno(), size)
             return
+        self._filename = None
         warnings.warn(
-            f"expected {path} with the {size} bytes that it had at the checkpoint, got {len(kept)}: episodes before "
-            "the checkpoint are missing in it",
+            f"expected {path} with the {size} bytes that it had at the checkpoint, got {len(kept)}: no more episodes "
+            "are written to it",
             UserWarning,
             stacklevel=2,
         )

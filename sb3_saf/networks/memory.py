@@ -62,6 +62,11 @@ class Memory(nn.Module):
             return self._from_start_to_start(inputs, memory, starts)
 
     def _compiled(self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor | None) -> th.Tensor:
+        if memory.shape != (shape := (inputs.shape[1], self.state_dim)):  # the kernels do not look
+            raise ValueError(
+                f"expected a state of shape {shape}, a row for each observation, got {tuple(memory.shape)}; pass the "
+                "state that was returned for these rows, or None where episodes begin"
+            )
         of_input, of_memory, input_bias, memory_bias = self.rnn.parameters()
         of_inputs = nn.functional.linear(inputs, of_input, input_bias)
         memories: th.Tensor = _Recurrence.apply(of_inputs, memory, starts, of_memory, memory_bias)

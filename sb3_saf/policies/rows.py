@@ -104,7 +104,7 @@ class TeamRowsPolicy(BasePolicy):
         state: Any = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-        **kwargs: Any,
+        action_masks: Any = None,
     ) -> tuple[Any, Any]:
         """
         Act as SB3's ``predict``: on rows, or on what the game itself gives.
@@ -124,17 +124,22 @@ class TeamRowsPolicy(BasePolicy):
             step before, ``{agent: state}``. None where episodes begin; agents that it lacks begin
         :param episode_start: as in SB3
         :param deterministic: as in SB3
-        :param kwargs: ``action_masks`` of MaskablePPO, for rows or in the form of the observation, with None for an
-            agent that may do everything
+        :param action_masks: of policies with masks in the form of the observation, with None for an agent that may do
+            everything; of MaskablePPO's also for rows
         :return: actions and the next state; ``{agent: action}`` for observations by agent
+        :raises ValueError: for masks that the policy cannot take
         """
-        given = self.given_by_game(observation, kwargs.get("action_masks"))
+        given = self.given_by_game(observation, action_masks)
         if given is not None:
             return given.act(self._predict_rows, state, episode_start, deterministic)
         if isinstance(observation, Mapping):  # critics' entries have shapes that depend on the size of the team
             unread = {TEAM_KEY, ACTIVE_KEY, STATE_KEY} | (set() if self.acts_by_index else {AGENT_KEY})
             observation = {key: value for key, value in observation.items() if key not in unread}
-        return self._predict_rows(observation, state, episode_start, deterministic, **kwargs)
+        if action_masks is None:
+            return self._predict_rows(observation, state, episode_start, deterministic)
+        if not isinstance(self, MaskableActorCriticPolicy):
+            raise ValueError(f"expected masks of actions in the rows, as {ACTION_MASK_KEY!r}, got action_masks")
+        return self._predict_rows(observation, state, episode_start, deterministic, action_masks=action_masks)
 
     def given_by_game(self, observation: Any, action_masks: Any = None) -> Given | None:
         """Convert what a game gives to rows (see :meth:`predict`); None for rows."""

@@ -24,7 +24,7 @@ class TeamError(NamedTuple):
 
     :param td: (G',) Q_tot - y
     :param q_tot: (G',)
-    :param weights: (G', N) lambda_i, or None; zero for inactive agents
+    :param weights: (G', N) lambda_i, or None; NaN for inactive agents
     """
 
     td: th.Tensor
@@ -79,6 +79,8 @@ def team_errors(policy: QPLEXPolicy, samples: TeamReplaySamples, gamma: float) -
         following = _q_values(policy.target, _recall(policy.target, features, samples).after, samples.after)
         value = _mix(policy, policy.target, following, samples.after, features.after, best).q_tot
         target = samples.rewards + gamma * (1.0 - samples.dones) * value
+        if weights is not None and samples.now.active is not None:
+            weights = weights.masked_fill(~samples.now.active, th.nan)
     error = TeamError(td - target, td, weights)
     if samples.sequences is None:
         return error
@@ -98,11 +100,8 @@ def _recall(networks: QNetworks, features: Features, samples: TeamReplaySamples)
         return features
     assert sequences is not None, "agents with memory learn from sequences"
     shape, (n, length) = samples.actions.shape, (sequences.n, sequences.length)
-    agent, starts, joins = _agents(samples.actions), sequences.resets.unsqueeze(1).expand(shape), None
+    agent, starts, joins = _agents(samples.actions), sequences.resets.unsqueeze(1) | (sequences.last_actions < 0), None
     if samples.now.active is not None and samples.after.active is not None:  # agents that join begin
-        before = samples.now.active.roll(1, dims=0)
-        before[::length] = True
-        starts = starts | ~before
         joins = (samples.after.active & ~samples.now.active).flatten()
     last = sequences.last_actions.masked_fill(starts, -1).flatten()
     inputs = memory.inputs(features.now.flatten(0, 1), last, agent)

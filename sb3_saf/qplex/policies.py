@@ -18,6 +18,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 from sb3_saf.buffers.replay import TeamSteps
@@ -302,10 +303,13 @@ class QPLEXPolicy(TeamRowsPolicy):
         parts = [None if module is None else next(copies) for module in self.online]
         return QNetworks(*parts)  # type: ignore[arg-type]
 
-    def parameter_pairs(self) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-        """Return the parameters of the online networks, and of the target networks in the same order."""
-        online = [parameter for module in self.online if module is not None for parameter in module.parameters()]
-        return online, list(self.target_networks.parameters())
+    def parameter_pairs(self) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """Return parameters and running statistics of the online networks, and of the targets in the same order."""
+        networks = (self.online, self.target_networks)
+        online, target = (
+            [part for module in modules if module is not None for part in _learned(module)] for modules in networks
+        )
+        return online, target
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         names = ["net_arch", "activation_fn", "ortho_init", "encode_once", "chunk_size"]
@@ -397,6 +401,11 @@ class QPLEXPolicy(TeamRowsPolicy):
         own = self._own(obs).unflatten(0, (-1, n_agents))
         states = None if self.state_encoder is None else obs[STATE_KEY][::n_agents]
         return TeamSteps(own, None, None if active is None else active[::n_agents], states)
+
+
+def _learned(module: nn.Module) -> list[th.Tensor]:
+    """Return parameters, and the running statistics of layers such as BatchNorm."""
+    return [*module.parameters(), *get_parameters_by_name(module, ["running_"])]
 
 
 class QPLEXPoolPolicy(QPLEXPolicy):

@@ -182,7 +182,6 @@ class PQN(QPLEX):
         buffer = self._buffer()
         if buffer.size() < self.rollout_steps:
             return
-        self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         rollout, shape = buffer.every_step(), (self.rollout_steps, self.n_games)
         with th.no_grad():
@@ -195,6 +194,7 @@ class PQN(QPLEX):
         cuts = th.as_tensor(ended, device=self.device)
         returns = lambda_returns(rewards, following, dones, cuts, self.gamma, self.td_lambda).flatten()
         errors = []
+        self.policy.set_training_mode(True)
         for _ in range(self.n_epochs):
             # SB3 seeds only NumPy's global generator from the run's seed.
             order = th.as_tensor(np.random.permutation(len(returns)), device=self.device)  # noqa: NPY002

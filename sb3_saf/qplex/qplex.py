@@ -21,7 +21,6 @@ from stable_baselines3.common.type_aliases import (
     RolloutReturn,
     Schedule,
     TrainFreq,
-    TrainFrequencyUnit,
 )
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecEnv
@@ -169,17 +168,13 @@ class QPLEX(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_settings()
-        if self._vec_normalize_env is not None:
-            raise ValueError(
-                "QPLEX does not train on VecNormalize, whose statistics change while steps are stored; scale in games"
-            )
         spaces_ = TeamSpaces.from_observation_space(self.observation_space)
         self.n_agents = spaces_.n_agents
         self.n_games = check_whole_teams(self.n_envs, self.n_agents, "give an environment of whole teams")
         if not isinstance(self.action_space, spaces.Discrete) or self.action_space.start != 0:
             raise ValueError(
-                f"QPLEX needs Discrete actions that count from 0, got {self.action_space}; for other actions use PPO "
-                'with "SAFPolicy", "MAPPOPolicy" or "IPPOPolicy"'
+                f"{type(self).__name__} needs Discrete actions that count from 0, got {self.action_space}; for other "
+                'actions use PPO with "SAFPolicy", "MAPPOPolicy" or "IPPOPolicy"'
             )
         super()._setup_model()
         if not isinstance(self.policy, QPLEXPolicy):
@@ -226,12 +221,6 @@ class QPLEX(OffPolicyAlgorithm):
             if not is_right:
                 raise ValueError(f"{name} must be {words}, got {getattr(self, name)!r}")
 
-    def _convert_train_freq(self) -> None:
-        """Set rollouts to one step of all games; :meth:`train` decides when updates are due."""
-        if not isinstance(self.train_freq, TrainFreq):
-            self.update_interval = int(self.train_freq)  # type: ignore[arg-type]
-        self.train_freq = TrainFreq(1, TrainFrequencyUnit.STEP)  # type: ignore[assignment]
-
     def _buffer(self) -> TeamReplayBuffer:
         assert self.replay_buffer is not None
         return self.replay_buffer
@@ -248,13 +237,14 @@ class QPLEX(OffPolicyAlgorithm):
         before = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
         loaded: Any = self.replay_buffer
-        if isinstance(loaded, TeamReplayBuffer) and loaded.n_envs == self.n_envs and loaded.n_agents == self.n_agents:
-            return
-        self.replay_buffer = before
-        raise ValueError(
-            f"expected a TeamReplayBuffer of {self.n_games} games of {self.n_agents} agents, got "
-            f"{type(loaded).__name__} of {loaded.n_envs} rows; train on as many games as before"
-        )
+        form = self.n_envs, self.observation_space, self.action_space
+        got = loaded.n_envs, loaded.observation_space, loaded.action_space
+        if not isinstance(loaded, TeamReplayBuffer) or got != form:
+            self.replay_buffer = before
+            raise ValueError(
+                f"expected a TeamReplayBuffer of rows and spaces {form}, got {type(loaded).__name__} of {got}; train "
+                "on as many games as before, with their spaces"
+            )
 
     def _game_steps(self) -> int:
         return self.num_timesteps // self.n_agents
@@ -323,7 +313,7 @@ class QPLEX(OffPolicyAlgorithm):
         """
         Play one step of all games, and count game steps and team episodes; see SB3.
 
-        :param train_freq: always one step
+        :param train_freq: unused; :meth:`train` decides when updates are due
         :param action_noise: unused
         :param learning_starts: game steps of random actions
         """
@@ -391,12 +381,15 @@ class QPLEX(OffPolicyAlgorithm):
         :param gradient_steps: unused; determined by the attributes ``gradient_steps`` and ``train_freq``
         :param batch_size: game steps per gradient step
         """
-        due = self._crossed(self.update_interval)
+        assert isinstance(self.train_freq, TrainFreq)
+        interval = self.train_freq.frequency
+        due = self._crossed(interval)
         if not due or self._game_steps() <= self.learning_starts:
             return
         self.policy.set_training_mode(True)
+        self.policy.target_networks.eval()
         self._update_learning_rate(self.policy.optimizer)
-        n_steps = due * (self.update_interval if self.gradient_steps < 0 else self.gradient_steps)
+        n_steps = due * (interval if self.gradient_steps < 0 else self.gradient_steps)
         parts, buffer = self.policy.parts, self._buffer()
         for _ in range(n_steps):
             if parts.memory is None:
@@ -416,8 +409,9 @@ class QPLEX(OffPolicyAlgorithm):
         record("train/td_error", error.td.abs().mean().item())
         record("train/q_tot", error.q_tot.mean().item())
         if error.weights is not None:
-            for agent, weight in enumerate(error.weights.mean(dim=0).tolist()):
-                record(f"lambda/agent_{agent}", weight)
+            for agent, weight in enumerate(error.weights.nanmean(dim=0).tolist()):
+                if weight == weight:  # it takes part
+                    record(f"lambda/agent_{agent}", weight)
 
     def learn(
         self: SelfQPLEX,
@@ -429,6 +423,11 @@ class QPLEX(OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfQPLEX:
         """Train as in SB3; ``total_timesteps`` counts rows (game steps times N), ``log_interval`` team episodes."""
+        if self._vec_normalize_env is not None:
+            raise ValueError(
+                f"{type(self).__name__} does not train on VecNormalize, whose statistics change while steps are "
+                "stored; scale in games"
+            )
         rows = self._rows_until(0 if reset_num_timesteps else self.num_timesteps, total_timesteps)
         name = tb_log_name or type(self).__name__
         return super().learn(rows, callback, log_interval, name, reset_num_timesteps, progress_bar)

@@ -439,7 +439,9 @@ class Given(NamedTuple):
         :param predict: acts on rows, as SB3's ``predict``, whose arguments the others are
         """
         agents, memory, starts = self.agents, state, episode_start
-        if agents is not None and state:
+        if agents is not None and not state:
+            memory = None
+        elif agents is not None:
             blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
             memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
             starts = np.array([agent not in state for agent in agents])
@@ -474,6 +476,8 @@ def given_by_game(
     :return: None for rows
     :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
     """
+    if action_masks is not None and not takes_masks:
+        raise ValueError("expected no action_masks, because this policy was trained without masks")
     infos: Mapping[Any, Any] = {}
     if isinstance(observation, tuple) and len(observation) == 2 and all(isinstance(x, Mapping) for x in observation):
         observation, infos = observation

@@ -297,7 +297,9 @@ def find_unfinished(
     :param options: as given to :func:`write_run`
     :return: its folder and seed; None if there is none
     :raises ValueError: if that run began with another model than ``options["initial_model"]``
+    :raises CheckpointError: if there are only runs that another process, or another user, writes to
     """
+    not_free: CheckpointError | None = None
     wanted = plain({"settings": settings.as_dict(), "options": options})
     for _, folder in reversed(runs_of(log_folder, settings.algo, settings.environment.folder_name)):
         try:
@@ -307,27 +309,24 @@ def find_unfinished(
         theirs, ours = dict(found["options"]), dict(wanted["options"])
         began_with, begins_with = (one.pop("initial_model", None) for one in (theirs, ours))
         same = found["settings"] == wanted["settings"] and theirs == ours and seed in (None, found["seed"])
-        if not same or (folder / FINISHED).exists() or not _can_go_on(folder / CHECKPOINTS):
+        store = CheckpointFolder(folder / CHECKPOINTS)
+        if not same or (folder / FINISHED).exists() or not store.checkpoints():
             continue
-        if began_with != begins_with:
+        try:
+            store.acquire()
+        except CheckpointError as error:
+            not_free = not_free or error
+            continue
+        store.release()
+        if (began_with and began_with["sha256"]) != (begins_with and begins_with["sha256"]):
             models = [f"the model {one['path']}" if one else "a new model" for one in (began_with, begins_with)]
             raise ValueError(
                 f"{folder} began with {models[0]}, got {models[1]}: give the -i of that run, or leave --resume out"
             )
         return folder, int(found["seed"])
+    if not_free is not None:
+        raise not_free
     return None
-
-
-def _can_go_on(folder: Path) -> bool:
-    store = CheckpointFolder(folder)
-    if not store.checkpoints():
-        return False
-    try:
-        store.acquire()
-    except CheckpointError:  # another process uses it
-        return False
-    store.release()
-    return True
 
 
 def find_model(

@@ -38,7 +38,7 @@ from sb3_saf.teams.checks import evaluation_seed
 from sb3_saf.teams.files import atomic_file, remove_leftovers
 from sb3_saf.teams.randomness import own_randomness
 from sb3_saf.teams.vec_env import require_n_agents
-from sb3_saf.training.folders import CHECKPOINTS, CURVE_POINTS, MONITOR, finish_run, write_curve
+from sb3_saf.training.folders import CHECKPOINTS, CURVE_POINTS, FINISHED, MONITOR, finish_run, write_curve
 from sb3_saf.training.settings import Settings
 from sb3_saf.training.wrappers import load_normalization, make_callbacks, save_normalization
 
@@ -310,7 +310,7 @@ def train(
     :param folder: folder for ``monitor.csv``, models, evaluations and checkpoints; None writes none of them
     :param callbacks: further callbacks, called before those of the options
     :return: the trained model; its games are closed
-    :raises ValueError: if the games or the model cannot be made
+    :raises ValueError: if the games or the model cannot be made, or the folder has a finished run
     :raises CheckpointError: if a checkpoint cannot be written or read
     :raises NonFiniteError: at NaN or infinity
     """
@@ -333,6 +333,8 @@ class Training:
         self.seed = seed
         self.folder = folder
         self.options = options or RunOptions()
+        if folder is not None and (folder / FINISHED).exists() and not any((folder / CHECKPOINTS).glob("*.ckpt")):
+            raise ValueError(f"{folder} has a finished run: give this one a folder of its own")
         if self.options.num_threads is not None:
             th.set_num_threads(self.options.num_threads)
         with ExitStack() as self._open:  # closes the parts already made if a later one fails
