@@ -166,6 +166,8 @@ def test_an_experiment_of_ones_own() -> None:
     assert spread.tests() == {Level.of(max_cycles=value): (Level.of(max_cycles=value),) for value in (5, 9)}
     assert Cell("saf", "a.b:c", Level.of(max_cycles=5), 0).id == "a.b-c-max_cycles5/saf/seed-0"
     assert Cell("saf", "a.b:c", Level(), 0).id == "a.b-c-default/saf/seed-0"
+    with pytest.raises(ValueError, match="--vary cannot take level, a column of the tables"):
+        own_experiment("mine", ["a"], {"level": [1, 2]})
     with pytest.raises(ValueError, match="--vary takes one parameter, got a, b"):
         own_experiment("mine", ["a.b"], {"a": [1], "b": [2]})
     with pytest.raises(ValueError, match="expects numbers or words, such as a:"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -218,7 +219,7 @@ def test_published_results_are_drawn_beside_ones_own(folder: Path, tmp_path: Pat
     page = report(mine, *words, str(tmp_path / "published"))
     row = part_of(page, "Team return by").split("| theirs |")[1].splitlines()[0]
     assert f"| IPPO, shared |{row}" in page  # equal numbers
-    assert "longer" not in page and "larger" not in page
+    assert "longer" not in page and "larger" not in page and "the same for all methods of a seed" in page
     assert report(mine, *words, str(tmp_path / "published" / "coordination")) == page
     assert set(pd.read_csv(mine / "coordination" / "runs.csv")["method"]) == {"saf", "ippo", "random"}
     (tmp_path / "published" / "coordination" / "runs.csv").write_text("a,b\n1,2\n")
@@ -339,3 +340,10 @@ def test_an_environment_of_ones_own(
     with pytest.raises(SystemExit, match="2"):
         cli.main(["report", "counter", "-f", str(folder)])
     assert name in capsys.readouterr().err
+    # One of two environments, whose other rewards make it another game.
+    two = own_experiment("two", [env, "tests.toy_envs:LazyEnv"], {})
+    shared = replace(config, overrides={**config.overrides, "team_reward": "mean"})
+    run(two, Selection((0,), ("ippo",), envs=(env,)), shared, Results(Path("two")), InlineEngine())
+    assert cli.main(["report", "two", "-f", "two"]) == 0
+    assert f"--tasks {env} -f two" in Path("two", "two", "report.md").read_text(encoding="utf-8")
+    assert not set(read_results(Path("two"), "two").tests["game"]) & set(table["game"])

@@ -73,6 +73,12 @@ def test_curves_are_drawn_where_they_are() -> None:
     assert [text.get_text() for text in two.legends[0].get_texts()] == ["saf (1 to 2 seeds)", "mappo (1 seed)"]
 
 
+def test_levels_are_numbers_in_order_or_words_as_they_come() -> None:
+    for given, drawn in (([2, 1], ["1", "2"]), (["small", "large"], ["small", "large"]), (["a", 2], ["a", "2"])):
+        table = pd.DataFrame({"method": "saf", "seed": 0, "size": given, "score": 1.0})
+        assert [label.get_text() for label in draw_levels(table, "size").axes[0].get_xticklabels()] == drawn
+
+
 def test_bars_are_means_of_seeds_not_of_episodes() -> None:
     table = pd.DataFrame(
         {

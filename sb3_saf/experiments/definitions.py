@@ -201,6 +201,10 @@ class Experiment(NamedTuple):
         return self._replace(views=tuple(view for view in views if view.levels))
 
 
+#: Columns of the tables, which no varied parameter can be.
+_COLUMNS: Final = frozenset({"method", "task", "level", "seed", "game_steps", "episodes", "actions", "length", "score"})
+
+
 def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[Any]]) -> Experiment:
     """
     Return an experiment on any environment, with the paper's methods.
@@ -217,6 +221,8 @@ def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[A
         )
     if len(vary) > 1:
         raise ValueError(f"--vary takes one parameter, got {', '.join(vary)}; give the others with --env-kwargs")
+    if taken := _COLUMNS.intersection(vary):
+        raise ValueError(f"--vary cannot take {', '.join(taken)}, a column of the tables; rename it in the environment")
     view = View("", (Level(),))
     for parameter, given in vary.items():
         values = given if isinstance(given, list) else [given]

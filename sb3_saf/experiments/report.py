@@ -255,7 +255,7 @@ def _head(content: Content) -> str:
         f"Size `{config.size}`: {_numbers(table['n_agents'])} agents{treasures}, {steps} game steps of training. "
         f"{', '.join(methods) or 'No method'} and a random team, seeds {_numbers(table['seed'])}. Each number is "
         f"{meaning} of the best policy of a run by evaluations during training, over {_numbers(table['episodes'])} new "
-        f"games with {actions}, the same for all methods of a seed.",
+        f"games with {actions}{', the same for all methods of a seed' if table['episodes'].nunique() == 1 else ''}.",
     ]
     if config.overrides:
         lines += ["", f"Settings in the place of those of `zoo_configs`: `{dict(config.overrides)}`."]
@@ -452,7 +452,7 @@ def _reproduction(content: Content) -> str:
         words += ["--episodes", str(content.config.episodes), "--seeds", *map(str, selection.seeds)]
         for option, values in (("methods", selection.methods), ("levels", selection.levels)):
             words += [f"--{option}", *values] if values else []
-        if experiment.name in EXPERIMENTS and selection.envs:
+        if selection.envs:
             words += ["--tasks", *(env.removesuffix("-v0") for env in selection.envs)]
         lines.append(f"{shlex.join(words)} -f {shlex.quote(str(folder))}")
     lines += [f"{PROGRAM} report {experiment.name} -f {shlex.quote(str(folder))}", "```", ""]

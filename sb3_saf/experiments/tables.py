@@ -65,6 +65,8 @@ CURVES: Final = "curves.csv"
 _PAGE_BYTES: Final = 300_000
 #: Settings of a run that are not of its training, or have a column of their own.
 _OF_GAMES: Final = frozenset({"algo", "env", "env_kwargs", "n_agents", "size", "game_steps"})
+#: Settings that change returns, and with them what is compared.
+_OF_REWARDS: Final = ("env_wrapper", "vec_env_wrapper", "team_reward")
 
 
 class Frames(NamedTuple):
@@ -189,6 +191,7 @@ def _rows(results: Results, cell: Cell) -> Iterator[dict[str, Any]]:
             "max_return": test.max_return,
             "game": _digest(
                 {key: value for key, value in settings["env_kwargs"].items() if key not in level.env_kwargs}
+                | {key: settings[key] for key in _OF_REWARDS if key in settings}
             ),
             "training": _digest({key: value for key, value in settings.items() if key not in _OF_GAMES}),
             "seed": cell.seed,

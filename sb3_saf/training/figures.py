@@ -200,7 +200,9 @@ def draw_levels(
     figure, all_axes = _figure(len(panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
         # Side by side at each level, in the order of the methods.
-        methods, levels = _methods_of(rows), sorted(rows[level].unique())
+        methods, levels = _methods_of(rows), list(dict.fromkeys(rows[level]))
+        if not any(isinstance(value, str) for value in levels):
+            levels.sort()
         width = min(0.3, 0.8 / len(methods))
         for index, method in enumerate(methods):
             of_method, style = rows[rows["method"] == method], styles[method]
