@@ -36,6 +36,7 @@ from sb3_saf import (
     resumable_learn,
     resume,
 )
+from sb3_saf.checkpoints.learning import CheckpointFolder
 from sb3_saf.envs.curriculum import Curriculum
 from sb3_saf.teams.vec_env import layers
 from tests.toy_envs import CounterEnv, LazyEnv, StateEnv, StreamEnv, TellingEnv
@@ -218,6 +219,19 @@ def test_tensorboard_may_begin_with_the_resumed_part(tmp_path: Path) -> None:
     go_on(tmp_path / "checkpoints", model)
     (folder,) = (tmp_path / "tb").iterdir()
     assert "train/loss" in EventAccumulator(str(folder)).Reload().Tags()["scalars"]
+
+
+def test_the_folder_is_locked_until_the_last_callback_has_ended(tmp_path: Path) -> None:
+    class Late(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_training_end(self) -> None:
+            with pytest.raises(CheckpointError, match="another run writes checkpoints"):
+                CheckpointFolder(tmp_path).acquire()
+
+    resumable_learn(make(), ROLLOUT, tmp_path, Late())
+    assert CheckpointFolder(tmp_path).acquire()
 
 
 def test_resume_alone(tmp_path: Path) -> None:

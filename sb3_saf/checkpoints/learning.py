@@ -136,14 +136,15 @@ class CheckpointFolder:
                 raise CheckpointError(f"cannot use the checkpoint {path}: {error}") from None
         return None
 
-    def acquire(self) -> None:
+    def acquire(self) -> bool:
         """
         Lock the folder until :meth:`release` or the end of this process.
 
+        :return: whether this call locked it
         :raises CheckpointError: if the folder cannot be created, or another run uses it
         """
         if self._lock is not None:
-            return
+            return False
         try:
             self._lock = try_lock(self.path / "lock")
         except OSError as error:
@@ -154,6 +155,7 @@ class CheckpointFolder:
             raise CheckpointError(
                 f"another run writes checkpoints to {self.path}; wait for its end, or give this run a folder of its own"
             )
+        return True
 
     def release(self) -> None:
         """Unlock the folder."""
@@ -218,7 +220,7 @@ class TeamCheckpointCallback(BaseCallback):
         self.others = list(all_callbacks(others))
         self.exact = exact
         self._run = Run("", {})
-        self._between_rollouts = False
+        self._between_rollouts = self._releases = False
         self._last: tuple[int, bytes] | None = None
         self._written: int | None = None
         self._stop: Callable[[], NoReturn] | None = None
@@ -227,7 +229,7 @@ class TeamCheckpointCallback(BaseCallback):
         require_resumable(self.model)
         require_n_agents(self.training_env)
         show_game_steps(self.model)
-        self.store.acquire()
+        self._releases = self.store.acquire()
         if self.model not in _RUNS:
             _RUNS[self.model] = Run(uuid.uuid4().hex, description(self.model, self.others))
         self._run = _RUNS[self.model]
@@ -275,7 +277,8 @@ class TeamCheckpointCallback(BaseCallback):
         if self._between_rollouts:
             self._take()
         self.write_last()
-        self.store.release()
+        if self._releases:  # not while other callbacks of resumable_learn go on
+            self.store.release()
 
     def stop_soon(self, stop: Callable[[], NoReturn]) -> None:
         """
