@@ -280,10 +280,13 @@ def test_returns_of_the_dead_go_on_where_their_team_is_paid(n_steps: int) -> Non
     active, after = team.active.copy(), np.array(ACTIVE[n_steps % 5])
     shape = (n_steps, 2, 1)
     values, rewards, last = rng.normal(size=shape), rng.normal(size=shape), rng.normal(size=(2, 1))
+    # Values that follow a time limit of the team are added to the rewards of those who take part.
+    over = np.vstack([team.episode_starts[1:], np.zeros((1, env.num_envs))]).reshape(active.shape)
+    followed = over * rng.normal(size=shape)
     for buffer, playing, then in ((team, active, after), (immortal, np.ones_like(active), np.ones_like(after))):
         buffer.active = playing
         buffer.values = (values * playing).reshape(n_steps, -1).astype(np.float32)
-        buffer.rewards = np.broadcast_to(rewards, active.shape).reshape(n_steps, -1).astype(np.float32)
+        buffer.rewards = (rewards + followed * playing).reshape(n_steps, -1).astype(np.float32)
         last_values = th.tensor((last * then).reshape(-1), dtype=th.float32)
         buffer.compute_returns_and_advantage(last_values, np.zeros(env.num_envs))
     rows = active.reshape(n_steps, -1) == 1

@@ -14,7 +14,7 @@ import sb3_saf
 from sb3_saf import Stage, make_team_env
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
-from tests.toy_envs import CounterEnv
+from tests.toy_envs import ZEROS, CounterEnv, Game
 
 SMALL: Final[dict[str, Any]] = {"n_agents": 3, "grid_size": 8, "n_treasures": 6}
 
@@ -81,6 +81,30 @@ def test_an_agent_that_a_limit_stops_as_its_stage_ends_keeps_its_last_observatio
         *_, infos = env.step(np.zeros(2, np.int64))
     last = infos[1]["terminal_observation"]
     assert last["obs"][:2].tolist() == [4, 1] and last["active"].tolist() == [1, 1]
+
+
+def test_an_agent_that_is_back_as_its_stage_ends_is_cut() -> None:
+    class Waiting(Game):
+        def change(self, out: list[Any]) -> None:
+            out[0]["b"] = ZEROS
+            self.agents = ["a"] if self.t == 1 else ["a", "b"]
+
+    env = make_team_env(Waiting, 1, time_limit="bootstrap", curriculum=[Stage(2, {})])
+    env.reset()
+    for _ in range(2):
+        *_, infos = env.step(np.zeros(2, np.int64))
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, True]
+
+
+def test_games_are_not_blamed_for_what_a_cut_episode_lacks() -> None:
+    class Won(Game):
+        def info(self, agent: Any) -> dict[str, Any]:
+            return {"is_success": True} if self.t == self.length else {}
+
+    env = make_team_env(Won, 1, curriculum=[Stage(5, {})])
+    env.reset()
+    for _ in range(9):
+        env.step(np.zeros(2, np.int64))  # warnings are errors
 
 
 def test_new_seeds_begin_with_the_first_stage() -> None:

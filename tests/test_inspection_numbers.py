@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from typing import Any
 
@@ -9,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from gymnasium import spaces
+from PIL import Image
 
+from sb3_saf.inspection import figures
 from sb3_saf.inspection.recording import EpisodeRecording, ReturnScale
 from sb3_saf.inspection.scalars import (
     attention_of,
@@ -18,6 +21,7 @@ from sb3_saf.inspection.scalars import (
     pool_scalars,
     team_scalars,
 )
+from sb3_saf.inspection.tensorboard import layout
 
 Array = npt.NDArray[Any]
 
@@ -178,3 +182,18 @@ def test_team_scalars() -> None:
     assert scalars["team/return_high"] == pytest.approx(15 + 12.7062 * 5, rel=1e-4)
     assert "team/share_of_best_return" not in team_scalars(game, ReturnScale(None, None))
     assert "team/return_low" not in team_scalars(recorded(), ReturnScale(None, None))
+
+
+def test_films_keep_colours_of_few_pixels() -> None:
+    rng = np.random.default_rng(0)
+    pictures = [rng.integers(80, 120, (200, 200, 1), dtype=np.uint8).repeat(3, axis=2) for _ in range(9)]
+    pictures[2][50:56, 50:56] = 220, 20, 30
+    with Image.open(io.BytesIO(figures.gif(pictures))) as film:
+        film.seek(2)
+        shown = np.asarray(film.convert("RGB")).astype(int)[53, 53]
+    assert np.abs(shown - [220, 20, 30]).max() < 40
+
+
+def test_charts_of_the_critic_are_there_from_the_beginning() -> None:
+    charts = layout(["team/return", "critic/bias"], value_based=False)["Critic"]  # all returns are 0 before training
+    assert ["Multiline", ["^critic/explained_variance$"]] in charts.values()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import csv
 import random
 from itertools import product
 from pathlib import Path
@@ -18,7 +19,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_saf import QPLEX, Actor, LightEncoder, evaluate_team, export_actors, make_team_env
+from sb3_saf import QPLEX, Actor, GameStepsCallback, LightEncoder, evaluate_team, export_actors, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import JointChoice, Mixer, MixerName, QMIXMixer, QPLEXMixer, VDNMixer
@@ -312,13 +313,16 @@ def test_logs_tell_what_is_learned(tmp_path: Path) -> None:
 
     model = make_model()
     model.set_logger(configure(str(tmp_path), ["csv"]))
-    model.learn(100 * 3, log_interval=8)
+    model.learn(100 * 3, GameStepsCallback(), log_interval=8)
     model.logger.close()
     header, *lines = (tmp_path / "progress.csv").read_text().splitlines()
     wanted = {"train/q_tot", "train/td_error", "train/loss", "rollout/exploration_rate", "rollout/replay_buffer_size"}
     wanted |= {f"lambda/agent_{i}" for i in range(3)} | {"time/game_steps", "rollout/ep_rew_mean"}
     assert wanted <= set(header.split(","))
     assert len(lines) == 100 // 5 // 8  # once for every 8 team episodes
+    for row in csv.DictReader([header, *lines]):
+        of_agents = [float(row[name]) for name in row if name.startswith("rollout/ep_rew_mean/")]
+        assert len(of_agents) == 3 and sum(of_agents) == pytest.approx(float(row["rollout/ep_rew_mean"]), rel=1e-4)
 
 
 # --- saving -----------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from sb3_saf.inspection.replay import replay
 from sb3_saf.training import replay as command
 from sb3_saf.training.train import train
 from tests.test_training_commands import failed
-from tests.toy_envs import CounterEnv
+from tests.toy_envs import CounterEnv, Game
 
 LEVEL: dict[str, Any] = {"n_agents": 3, "grid_size": 9, "n_treasures": 12, "max_cycles": 12, "heterogeneity": 2}
 SEED = 7
@@ -113,6 +113,50 @@ def test_the_grid_is_that_of_the_game(model: PPO, tmp_path: Path) -> None:
         obs, *_ = env.step(np.concatenate([actions, np.zeros(3, dtype=int)]).astype(int))
     assert obs is not None and len(pose) == run["steps"] + 1
     assert data["grid"]["zones"] == [0, 0, 0, 0, 0, 1, 1, 1, 1]
+
+
+def test_each_game_has_its_walls(model: PPO, tmp_path: Path) -> None:
+    runs = data_of(replay(model, make_env(), tmp_path / "page.html", seed=SEED, episodes=2))["runs"]
+    env = make_env()
+    env.seed(SEED)
+    env.reset()
+    walls = [np.argwhere(state["walls"]).tolist() for state in env.env_method("get_state", indices=[0, 3])]
+    assert [sorted(run["walls"]) for run in runs] == walls and walls[0] != walls[1]
+
+
+class Lane(Game):
+    """Agents move on a line; actions count from 1, and the second agent has ended after two steps."""
+
+    action_names = ("left", "stay", "right")
+
+    def action_space(self, agent: Any) -> spaces.Space[Any]:
+        return spaces.Discrete(3, start=1)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self.x = {"a": 4, "b": 5}
+        return super().reset(seed, options)
+
+    def change(self, out: list[Any]) -> None:
+        for agent, action in self.actions.items():
+            self.x[agent] += action - 2
+        if self.t >= 2:
+            out[2]["b"], self.agents = True, ["a"]
+
+    def replica(self) -> Lane:
+        return Lane()
+
+    def grid_scene(self) -> dict[str, Any]:
+        poses = [[self.x[agent], 0, 0, 0] for agent in self.possible_agents]
+        return {"width": 9, "height": 1, "zones": [0] * 9, "walls": [], "keys": [], "treasures": [], "agents": poses}
+
+
+def test_a_grid_of_ones_own_is_played_again_with_the_games_actions(tmp_path: Path) -> None:
+    env = sb3_saf.make_team_env(Lane, 1, seed=0)
+    model = PPO("IPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
+    (run,) = data_of(replay(model, env, tmp_path / "page.html", seed=SEED))["runs"]
+    moves = unpacked(run["actions"]).astype(int) - 1
+    moves[2:, 1] = 0
+    assert np.diff(unpacked(run["pose"])[:, :, 0], axis=0).tolist() == moves.tolist() != np.zeros((4, 2)).tolist()
 
 
 @pytest.mark.parametrize("policy", ["MAPPOPolicy", "QPLEXPoolPolicy"])

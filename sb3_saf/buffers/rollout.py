@@ -482,6 +482,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         if self.active is not None:
             counted = self.active.reshape(self.buffer_size, self.n_envs) != 0
         if self.active is not None and self.ends == "team":
+            # At a time limit of the team the values that follow were added to the rewards of those who take part.
+            over = np.vstack([self.episode_starts[1:], np.asarray(dones, dtype=np.float32)]) != 0
+            over &= ~counted & self.active.any(axis=2).repeat(self.n_agents, axis=1)
+            self.rewards = np.where(over, self._with_values_of_teams(self.rewards, counted), self.rewards)
             self.values = self._with_values_of_teams(self.values, counted)
             last = last_values.reshape(-1).cpu().numpy()
             last_values = th.from_numpy(self._with_values_of_teams(last, last != 0))

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.rows import STAGGERED, TERMINAL_OBSERVATION, TRUNCATED
+from sb3_saf.teams.rows import ACTIVE_KEY, STAGGERED, TERMINAL_OBSERVATION, TRUNCATED
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
 
 
@@ -82,13 +82,15 @@ class Curriculum(TeamVecEnvWrapper):
         self.game_steps += self.n_games
         if self._present_stage() == self.stage:
             return obs, rewards, dones, infos
-        shown = []
+        shown, playing = [], obs.get(ACTIVE_KEY) if isinstance(obs, dict) else None
         for row, (done, info) in enumerate(zip(dones, infos, strict=True)):
             if not done:  # a running episode is truncated
                 last = (
                     {key: part[row].copy() for key, part in obs.items()} if isinstance(obs, dict) else obs[row].copy()
                 )
-                is_cut = info.get(TRUNCATED, bool(info.get("active", True)))
+                # Whoever waited, and is back, has an observation.
+                goes_on = info.get(ACTIVE_KEY, True) if playing is None else playing[row]
+                is_cut = info.get(TRUNCATED, bool(goes_on))
                 # An agent that its own time limit stopped in this step has a last observation.
                 info = {TERMINAL_OBSERVATION: last, **info, TRUNCATED: is_cut, STAGGERED: True}
             shown.append(info)

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.teams.checks import check_choice
-from sb3_saf.teams.rows import IS_SUCCESS
+from sb3_saf.teams.rows import IS_SUCCESS, STAGGERED
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper, check_finite, episode_value, team_dones
 
 _COLUMNS: Final = frozenset({"r", "l", "t"})
@@ -130,7 +130,8 @@ class TeamMonitor(TeamVecEnvWrapper):
     def _finish_episode(self, game: int, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the last infos of a game's agents, with the episode in that of agent 0."""
         of_episode = {**self._notes[game], **self._noted(infos)}
-        missing = [key for key in self.info_keywords if key not in of_episode]
+        is_cut = any(STAGGERED in info for info in infos)  # by a curriculum, not by the game
+        missing = [key for key in self.info_keywords if key not in of_episode and not is_cut]
         if missing and not self._has_warned:
             self._has_warned = True
             given = sorted({str(key) for info in infos for key in info})
@@ -154,7 +155,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._notes[game] = {}
         self.episode_count += 1
         copies = [dict(info) for info in infos]
-        told = self._success_is_told | {IS_SUCCESS in of_episode}
+        told = self._success_is_told | (set() if is_cut else {IS_SUCCESS in of_episode})
         if len(told) > len(self._success_is_told) == 1:
             warnings.warn(
                 f"some episodes end with {IS_SUCCESS!r} in their infos, others do not, and success rates are those of "

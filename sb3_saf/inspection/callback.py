@@ -72,9 +72,7 @@ class Inspection(NamedTuple):
         """Figures by their names in TensorBoard. Needs matplotlib."""
         recording, counted = self.recording, self.recording.counted
         values, returns = recording.values[counted], recording.returns[counted]
-        unit = self.scale.unit and f"{self.scale.unit} {'of the team' if recording.of_team else 'per agent'}"
-        calibration = figures.calibration(values, returns, numbers.calibrate(values, returns), unit)
-        plots = {"critic/calibration": calibration}
+        plots = {"critic/calibration": figures.calibration(values, returns, numbers.calibrate(values, returns))}
         if recording.pool_weights is not None and recording.pool_actions is not None:
             weights = recording.pool_weights[counted]
             agents = np.broadcast_to(np.arange(counted.shape[1]) % recording.n_agents, counted.shape)[counted]

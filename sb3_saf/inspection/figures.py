@@ -66,7 +66,7 @@ def _heat_map(axes: Axes, table: Doubles, unit: str, vmax: float | None = None, 
     if percent:
         from matplotlib.ticker import PercentFormatter
 
-        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
 def _ticks(axes: Axes, rows: Sequence[str], columns: Sequence[str]) -> None:
@@ -153,19 +153,16 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
     panels[-1].set_xlabel("game step")
     from matplotlib.ticker import PercentFormatter
 
-    figure.colorbar(
-        picture, ax=panels, label="attention", pad=0.02, aspect=25, format=PercentFormatter(1.0, decimals=0)
-    )
+    figure.colorbar(picture, ax=panels, label="attention", pad=0.02, aspect=25, format=PercentFormatter(1.0))
     return figure
 
 
-def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration, unit: str | None) -> Figure:
+def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration) -> Figure:
     """
     Draw values against returns, and mean returns of tenths by value.
 
     :param values: (n,)
     :param returns: (n,)
-    :param unit: unit of returns
     """
     figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
@@ -185,8 +182,7 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Ca
         capsize=3,
         label="tenths: mean ± standard deviation",
     )
-    of_unit = f" ({unit})" if unit else ""
-    axes.set(xlabel=f"value{of_unit}", ylabel=f"discounted return{of_unit}")
+    axes.set(xlabel="value", ylabel="discounted return")
     numbers = [
         ("explained variance", summary.explained_variance, ".2f"),
         ("slope", summary.slope, ".2f"),
@@ -202,7 +198,9 @@ def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Ca
 
 #: Largest height in pixels of the GIF.
 _HEIGHT: Final = 320
-_COLOURS: Final = 64
+_COLOURS: Final = 256
+#: Pictures that the colours are taken from.
+_SAMPLED: Final = 200
 
 
 def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:
@@ -217,9 +215,9 @@ def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:
     frames = [Image.fromarray(picture) for picture in pictures]
     for frame in frames:
         frame.thumbnail((frame.width, _HEIGHT), Image.Resampling.BILINEAR, reducing_gap=None)
-    # One palette for all, from the first, the middle and the last frame.
-    sample = np.concatenate([np.asarray(frames[index]) for index in (0, len(frames) // 2, -1)])
-    palette = Image.fromarray(sample).quantize(_COLOURS)
+    # One palette for all. The median cut would leave out colours of few pixels, such as those of agents.
+    sample = np.concatenate([np.asarray(frame) for frame in frames[:: 1 + len(frames) // _SAMPLED]])
+    palette = Image.fromarray(sample).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     file = io.BytesIO()
     indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * seconds), loop=0)

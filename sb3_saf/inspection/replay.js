@@ -71,7 +71,7 @@ function drawStage(run, element) {
     c.fillRect(x * s, 0, s + 1, width);
   }
   c.fillStyle = "#4a412a";
-  for (const [x, y] of data.grid.walls) c.fillRect(x * s, y * s, s + 0.5, s + 0.5);
+  for (const [x, y] of run.walls) c.fillRect(x * s, y * s, s + 0.5, s + 0.5);
   run.treasures.forEach(([x, y], i) => drawTreasure(c, x, y, s, run.collected[i] >= 0 && run.collected[i] <= t));
   for (const [x, y] of (run.keys && run.keys[t]) || []) drawKey(c, x, y, s);
   for (const agent of range(data.n_agents)) drawTrail(c, run, agent, t, s);
@@ -218,7 +218,7 @@ function drawSource(run) {
   if (!run.read) return;
   const t = row(state.t, run);
   const strength = run.message ? run.message.at(t, state.agent) : NaN;
-  $("message").innerHTML = `Message: without it, this agent's value changes by <b id="strength" data-number="${strength}">${show(strength, 3)}</b>.`;
+  $("message").innerHTML = `Messages: without them, this agent's value changes by <b id="strength" data-number="${strength}">${show(strength, 3)}</b>.`;
   const slots = range(run.read.shape[2]);
   const numbers = slots.map((l) => run.read.at(t, state.agent, l));
   const heard = slots.map((l) => run.write.at(t, l, state.agent));

@@ -176,8 +176,13 @@ def _played_again(actions: npt.NDArray[Any], env: VecEnv, game: int, seed: int) 
     seeds: Any = next(layer.seeded_with for layer in layers(env) if hasattr(layer, "seeded_with"))
     replica.reset(seed=int(seeds[game]))
     scenes = [replica.grid_scene()]
+    conversions = TeamSpaces.from_observation_space(env.observation_space).conversions
     for of_agents in actions:
-        replica.step(dict(zip(replica.possible_agents, of_agents.tolist(), strict=True)))
+        given = of_agents.tolist()
+        if conversions is not None:
+            given = [one.game_action(action) for one, action in zip(conversions, of_agents, strict=True)]
+        taken = dict(zip(replica.possible_agents, given, strict=True))
+        replica.step({agent: taken[agent] for agent in replica.agents})
         scenes.append(replica.grid_scene())
     is_collected = np.array([[treasure[2] for treasure in scene["treasures"]] for scene in scenes], dtype=bool)
     first = (
@@ -185,11 +190,12 @@ def _played_again(actions: npt.NDArray[Any], env: VecEnv, game: int, seed: int) 
     )
     run = {
         "pose": _packed(np.array([scene["agents"] for scene in scenes]), "i2"),
+        "walls": scenes[0]["walls"],
         "treasures": [treasure[:2] for treasure in scenes[0]["treasures"]],
         "collected": first.tolist(),
         "keys": [scene["keys"] for scene in scenes] if any(scene["keys"] for scene in scenes) else None,
     }
-    return run, {key: scenes[0][key] for key in ("width", "height", "walls", "zones")}
+    return run, {key: scenes[0][key] for key in ("width", "height", "zones")}
 
 
 def _packed(array: npt.ArrayLike, kind: str, scale: float = 1) -> Packed:

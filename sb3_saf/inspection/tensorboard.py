@@ -25,12 +25,10 @@ _NUMBERS_ONLY: Final = ("stdout", "log", "json", "csv")
 #: Hyperparameters to show, if the algorithm has them.
 _SHOWN: Final = (
     *("n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
-    *("buffer_size", "learning_starts", "update_interval", "target_update_interval", "exploration_fraction"),
+    *("buffer_size", "learning_starts", "target_update_interval", "exploration_fraction"),
 )
 #: Scalars to show with the hyperparameters.
-_METRICS: Final = (
-    *("team/return", "critic/explained_variance", "pool/entropy", "pool/difference", "message/value_error"),
-)
+_METRICS: Final = ("team/return", "critic/explained_variance", "pool/entropy", "pool/difference")
 
 #: Explanation of the groups of tags on the Text page.
 _TEXT: Final = """
@@ -88,8 +86,8 @@ _CHARTS: Final[dict[str, dict[str, list[str]]]] = {
         "error (root mean square)": [r"critic/error"],
     },
 }
-#: Groups logged by algorithms, after the layout is made.
-_OF_ALGORITHMS: Final = ("rollout/", "time/", "train/", "lambda/")
+#: Groups logged after the layout is made: by algorithms, and by critics whose returns were equal until then.
+_LATER: Final = ("rollout/", "time/", "train/", "lambda/", "critic/")
 #: Charts of algorithms with Q_tot.
 _VALUE_CHARTS: Final[dict[str, dict[str, list[str]]]] = {
     "Mixer": {
@@ -205,7 +203,7 @@ def layout(tags: Iterable[str], value_based: bool) -> dict[str, dict[str, list[A
         lines = {
             name: patterns
             for name, patterns in charts.items()
-            if any(p.startswith(_OF_ALGORITHMS) or any(re.fullmatch(p, tag) for tag in tags) for p in patterns)
+            if any(p.startswith(_LATER) or any(re.fullmatch(p, tag) for tag in tags) for p in patterns)
         }
         if lines:
             groups[group] = {name: ["Multiline", [f"^{p}$" for p in patterns]] for name, patterns in lines.items()}
@@ -244,6 +242,7 @@ def hyperparameters(
         "features_extractor": type(policy.features_extractor).__name__,
         "learning_rate": model.lr_schedule(1.0),
         **{name: getattr(model, name, None) for name in _SHOWN},
+        "train_freq": getattr(getattr(model, "train_freq", None), "frequency", None),
     }
     values = {
         name: value if isinstance(value, (bool, str, float, int)) else str(value)

@@ -336,8 +336,8 @@ class TeamPolicy(RememberingPolicy):
         )
         self._warned_of_minibatch = True
         warnings.warn(
-            "The minibatch has rows of agents that take no part (dead, or not joined yet); they enter the loss, the "
-            f"entropy and the normalisation of advantages. {advice}",
+            "The minibatch has rows of agents that take no part (dead, away, or not joined yet); they enter the loss, "
+            f"the entropy and the normalisation of advantages, and an absence ends the agent's return. {advice}",
             UserWarning,
             stacklevel=3,
         )

@@ -350,12 +350,12 @@ class QPLEX(OffPolicyAlgorithm):
         self._on_step()
         n_episodes = int(np.count_nonzero(dones)) // self.n_agents
         self._episode_num += n_episodes
+        callback.on_rollout_end()
         if (
             log_interval is not None
             and self._episode_num // log_interval > (self._episode_num - n_episodes) // log_interval
         ):
             self.dump_logs()
-        callback.on_rollout_end()
         return RolloutReturn(self.n_games, n_episodes, continue_training=True)
 
     def _on_step(self) -> None:
