@@ -71,7 +71,7 @@ def _heat_map(axes: Axes, table: Doubles, unit: str, vmax: float | None = None, 
 
 def _ticks(axes: Axes, rows: Sequence[str], columns: Sequence[str]) -> None:
     axes.set_yticks(range(len(rows)), rows)
-    axes.set_xticks(range(len(columns)), columns)
+    axes.set_xticks(range(len(columns)), columns, rotation=0 if len("".join(columns)) < 45 else 90)
     axes.tick_params(length=0)
 
 
@@ -87,12 +87,12 @@ def chosen_by_zone(table: Doubles, colours: Sequence[Colour] | None) -> Figure:
     figure, (axes,) = _figure(5.6, 1.8 + 0.55 * max(3, n_zones), title="Which policy acts in which zone")
     _heat_map(axes, table, "chosen", vmax=1.0)
     _ticks(axes, [f"zone {zone}" for zone in range(n_zones)], [f"policy {policy}" for policy in range(n_policies)])
-    if colours is not None:
+    if colours:
         from matplotlib.patches import Rectangle
 
         # A band of the zone's colour between the labels and the table.
         for zone in range(n_zones):
-            axes.add_patch(Rectangle((-0.58, zone - 0.5), 0.07, 1, color=colours[zone], clip_on=False))
+            axes.add_patch(Rectangle((-0.58, zone - 0.5), 0.07, 1, color=colours[zone % len(colours)], clip_on=False))
         axes.tick_params(axis="y", pad=10)
     return figure
 
