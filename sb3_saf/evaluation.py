@@ -292,7 +292,9 @@ def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False)
     """
     check_trained_on(model, env)
     policy = getattr(model, "policy", model)
-    takes_masks = isinstance(policy, MaskableActorCriticPolicy) or "action_masks" in signature(model.predict).parameters
+    takes_masks = isinstance(policy, MaskableActorCriticPolicy) or (
+        not isinstance(policy, TeamRowsPolicy) and "action_masks" in signature(model.predict).parameters
+    )
     asks_for_masks = takes_masks and is_masking_supported(env)
     state: State = None
 

@@ -28,6 +28,7 @@ from sb3_saf.experiments.cell import Job, play, run_job
 from sb3_saf.experiments.definitions import RANDOM, Cell, Level, RunConfig, Selection, Shard, find_experiment
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
+from sb3_saf.experiments.tables import requested
 from sb3_saf.teams.files import differences, read_json, write_json
 from sb3_saf.teams.vec_env import game_seeds_of
 from sb3_saf.training.folders import finish_run
@@ -304,6 +305,23 @@ def test_changed_files_of_zoo_configs_are_refused(undisturbed: Path, tmp_path: P
     write_json(cell_of(folder) / "run.json", description)
     finish_run(cell_of(folder))
     assert "hyperparams.n_epochs was 9, now 2; restore them, delete that cell" in refused(folder, SMOKE)
+    with pytest.raises(ValueError, match="n_epochs was 9, now 2"):  # the report would have both
+        run_inline(folder, replace(TWO, seeds=(2,)))
+
+
+def test_a_changed_test_is_not_taken_for_good_by_a_further_one(undisturbed: Path, tmp_path: Path) -> None:
+    results = Results(shutil.copytree(undisturbed, tmp_path / "copy"))
+    cell = next(cell for cell in requested(find_experiment("joint"), results) if cell.id == CELL)
+    (test,) = (results.cell_folder(cell) / "tests").iterdir()
+    test.write_text(test.read_text() + " ")
+    (results.unfinished(cell) / "result" / "tests").mkdir(parents=True)
+    results.publish(cell)
+    assert results.run(cell) is not None and results.missing_tests(cell) == cell.tests
+
+
+def test_a_worker_that_ends_without_results_has_failed(tmp_path: Path) -> None:
+    summary, _ = run_inline(tmp_path, ONE, engine=InlineEngine(lambda folder: None))
+    assert not summary.finished and [cell.method for cell in summary.failed] == ["ippo", RANDOM]
 
 
 def test_differences() -> None:

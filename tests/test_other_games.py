@@ -594,6 +594,16 @@ def test_games_on_the_global_generator_differ_between_processes_and_repeat() -> 
     np.testing.assert_array_equal(obs, first())
 
 
+class Alternating(Game):
+    """One agent plays, the other one in the next episode."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        observations, infos = super().reset(seed, options)
+        self.n_resets = getattr(self, "n_resets", 0) + 1
+        self.agents = ["ab"[self.n_resets % 2]]
+        return {agent: observations[agent] for agent in self.agents}, infos
+
+
 @pytest.mark.parametrize("draws", [True, False])
 def test_a_game_that_ignores_its_seed_is_named(draws: bool) -> None:
     class Stubborn(Game):
@@ -610,8 +620,9 @@ def test_a_game_that_ignores_its_seed_is_named(draws: bool) -> None:
     if draws:
         with pytest.warns(UserWarning, match=r"ignore reset\(seed"):
             env.step(np.zeros(4, int))
-        with pytest.warns(UserWarning, match="first observations of a differ in two resets with the seed 0"):
-            check_team_env(Stubborn())
+        for game, agent in ((Stubborn(), "a"), (Alternating(), "[ab]")):
+            with pytest.warns(UserWarning, match=f"first observations of {agent} differ in two resets with the seed 0"):
+                check_team_env(game)
     else:
         env.step(np.zeros(4, int))  # a game without chance: warnings are errors
         check_team_env(Stubborn())

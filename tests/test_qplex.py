@@ -259,7 +259,8 @@ def test_agents_learn_where_some_die_join_and_may_not_do_everything(policy: str)
     before = weights_of(model)
     model.learn(60 * 3)
     assert before != weights_of(model)
-    assert evaluate_team(model, env, 4, deterministic=False).lengths == [5] * 4
+    for player in (model, model.policy):
+        assert evaluate_team(player, env, 4, deterministic=False).lengths == [5] * 4
 
 
 def test_each_agent_tosses_its_own_coin() -> None:

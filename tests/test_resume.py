@@ -217,8 +217,13 @@ def test_tensorboard_may_begin_with_the_resumed_part(tmp_path: Path) -> None:
     model = make()
     model.tensorboard_log = str(tmp_path / "tb")
     go_on(tmp_path / "checkpoints", model)
-    (folder,) = (tmp_path / "tb").iterdir()
-    assert "train/loss" in EventAccumulator(str(folder)).Reload().Tags()["scalars"]
+    struck(tmp_path / "other", make(), N_STEPS + 2)
+    other = make()
+    other.tensorboard_log = model.tensorboard_log
+    go_on(tmp_path / "other", other)
+    folders = sorted((tmp_path / "tb").iterdir())
+    assert [folder.name for folder in folders] == ["resumed_1", "resumed_2"]
+    assert "train/loss" in EventAccumulator(str(folders[0])).Reload().Tags()["scalars"]
 
 
 def test_the_folder_is_locked_until_the_last_callback_has_ended(tmp_path: Path) -> None:
@@ -231,7 +236,7 @@ def test_the_folder_is_locked_until_the_last_callback_has_ended(tmp_path: Path) 
                 CheckpointFolder(tmp_path).acquire()
 
     resumable_learn(make(), ROLLOUT, tmp_path, Late())
-    assert CheckpointFolder(tmp_path).acquire()
+    CheckpointFolder(tmp_path).acquire()
 
 
 def test_resume_alone(tmp_path: Path) -> None:

@@ -136,15 +136,14 @@ class CheckpointFolder:
                 raise CheckpointError(f"cannot use the checkpoint {path}: {error}") from None
         return None
 
-    def acquire(self) -> bool:
+    def acquire(self) -> None:
         """
         Lock the folder until :meth:`release` or the end of this process.
 
-        :return: whether this call locked it
         :raises CheckpointError: if the folder cannot be created, or another run uses it
         """
         if self._lock is not None:
-            return False
+            return
         try:
             self._lock = try_lock(self.path / "lock")
         except OSError as error:
@@ -155,7 +154,6 @@ class CheckpointFolder:
             raise CheckpointError(
                 f"another run writes checkpoints to {self.path}; wait for its end, or give this run a folder of its own"
             )
-        return True
 
     def release(self) -> None:
         """Unlock the folder."""
@@ -220,16 +218,18 @@ class TeamCheckpointCallback(BaseCallback):
         self.others = list(all_callbacks(others))
         self.exact = exact
         self._run = Run("", {})
-        self._between_rollouts = self._releases = False
+        self._between_rollouts = False
         self._last: tuple[int, bytes] | None = None
         self._written: int | None = None
         self._stop: Callable[[], NoReturn] | None = None
+        #: Whether the folder is free after the training's end, before other callbacks have ended.
+        self._releases = True
 
     def _init_callback(self) -> None:
         require_resumable(self.model)
         require_n_agents(self.training_env)
         show_game_steps(self.model)
-        self._releases = self.store.acquire()
+        self.store.acquire()
         if self.model not in _RUNS:
             _RUNS[self.model] = Run(uuid.uuid4().hex, description(self.model, self.others))
         self._run = _RUNS[self.model]
@@ -277,7 +277,7 @@ class TeamCheckpointCallback(BaseCallback):
         if self._between_rollouts:
             self._take()
         self.write_last()
-        if self._releases:  # not while other callbacks of resumable_learn go on
+        if self._releases:
             self.store.release()
 
     def stop_soon(self, stop: Callable[[], NoReturn]) -> None:
@@ -442,6 +442,7 @@ def resumable_learn(
     given = [] if callback is None else [callback] if isinstance(callback, BaseCallback) else list(callback)
     checkpoints = TeamCheckpointCallback(folder, every_game_steps, keep, given, exact, verbose=model.verbose)
     checkpoints.store.acquire()
+    checkpoints._releases = False
     try:
         if checkpoints.store.checkpoints():
             path = resume(folder, model, given, exact=exact, trust_games=trust_games)

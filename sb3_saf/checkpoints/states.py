@@ -37,6 +37,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.utils import get_latest_run_id
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
@@ -461,7 +462,8 @@ def continue_logs(model: BaseAlgorithm, state: Tree) -> None:
         else:
             from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
-            folder = os.path.join(model.tensorboard_log, os.path.basename(state["tensorboard"] or "resumed"))
+            new = f"resumed_{get_latest_run_id(model.tensorboard_log, 'resumed') + 1}"
+            folder = os.path.join(model.tensorboard_log, os.path.basename(state["tensorboard"] or new))
             logger, board = configure(folder, formats), TensorBoardOutputFormat(folder)
             logger.output_formats.append(board)
             # TensorBoard hides entries written after the checkpoint, which are written again.

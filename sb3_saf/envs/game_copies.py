@@ -16,6 +16,7 @@ import random
 import secrets
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from copy import deepcopy
@@ -102,7 +103,14 @@ class _Unpickler(pickle.Unpickler):
         self._layers = layers_of(game)
 
     def persistent_load(self, pid: Any) -> Any:
-        return vars(self._layers[pid[0]]).get(pid[1])  # None for what a game makes later
+        attributes, name = vars(self._layers[pid[0]]), pid[1]
+        if name not in attributes:
+            warnings.warn(
+                f"the game's {name} was made after its reset and cannot be pickled: it is None after the resumption",
+                UserWarning,
+                stacklevel=2,
+            )
+        return attributes.get(name)
 
 
 def pickled(game: Any) -> npt.NDArray[np.uint8]:

@@ -130,7 +130,7 @@ class TeamMonitor(TeamVecEnvWrapper):
     def _finish_episode(self, game: int, infos: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """Return the last infos of a game's agents, with the episode in that of agent 0."""
         of_episode = {**self._notes[game], **self._noted(infos)}
-        is_cut = any(STAGGERED in info for info in infos)  # by a curriculum, not by the game
+        is_cut = any(STAGGERED in info for info in infos)
         missing = [key for key in self.info_keywords if key not in of_episode and not is_cut]
         if missing and not self._has_warned:
             self._has_warned = True
@@ -245,8 +245,8 @@ class TeamMonitor(TeamVecEnvWrapper):
             return
         self._filename = None
         warnings.warn(
-            f"expected {path} with the {size} bytes that it had at the checkpoint, got {len(kept)}: no more episodes "
-            "are written to it",
+            f"no episodes are written to {path}, which lacks those before the checkpoint: it had {size} bytes "
+            f"then, now {len(kept)}",
             UserWarning,
             stacklevel=2,
         )

@@ -202,7 +202,12 @@ class Experiment(NamedTuple):
 
 
 #: Columns of the tables, which no varied parameter can be.
-_COLUMNS: Final = frozenset({"method", "task", "level", "seed", "game_steps", "episodes", "actions", "length", "score"})
+_COLUMNS: Final = {
+    *("method", "task", "train_level", "level", "max_return", "game", "training", "seed", "game_steps"),
+    *("best_game_steps", "episodes", "actions", "return_mean", "return_low", "return_high", "return_sd", "return_last"),
+    *("return_most_likely", "return_last_most_likely", "success_rate", "length", "score", "agent_returns", "commit"),
+    *("processor_seconds", "wall_seconds_training", "wall_seconds_test", "processor", "cell"),
+}
 
 
 def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[Any]]) -> Experiment:

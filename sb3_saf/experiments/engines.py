@@ -83,7 +83,7 @@ class LocalEngine(Engine):
 
     def submit(self, folder: Path) -> Future[None]:
         """Start a job; see :meth:`Engine.submit`."""
-        with (folder / "log.txt").open("wb") as log:
+        with (folder / "log.txt").open("ab") as log:
             # A new session: Ctrl-C in a terminal must reach this process only.
             self._processes[folder] = subprocess.Popen(
                 [*self._command, str(folder)],
@@ -217,7 +217,7 @@ def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             for file, content in inputs.items():
                 (folder / file).write_bytes(content)
-        log = stack.enter_context((folder / "log.txt").open("w", encoding="utf-8"))
+        log = stack.enter_context((folder / "log.txt").open("a", encoding="utf-8"))
         with contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             run_job(folder)
         if is_shared:

@@ -453,7 +453,7 @@ def _reproduction(content: Content) -> str:
         for option, values in (("methods", selection.methods), ("levels", selection.levels)):
             words += [f"--{option}", *values] if values else []
         if selection.envs:
-            words += ["--tasks", *(env.removesuffix("-v0") for env in selection.envs)]
+            words += ["--tasks", *selection.envs]
         lines.append(f"{shlex.join(words)} -f {shlex.quote(str(folder))}")
     lines += [f"{PROGRAM} report {experiment.name} -f {shlex.quote(str(folder))}", "```", ""]
     lines.append(

@@ -224,8 +224,11 @@ class Results:
     def publish(self, cell: Cell) -> None:
         """Move the result of an attempt to the cell's folder: a new folder, or further tests of a finished one."""
         result, target = self.unfinished(cell) / "result", self.cell_folder(cell)
-        if self.run(cell) is not None:
+        if (run := self.run(cell)) is not None:
             (target / "tests").mkdir(exist_ok=True)
+            for name in [f"tests/{path.name}" for path in target.glob("tests/*")]:
+                if run.damage(name) is not None:  # or finish_run would take it for what was tested
+                    (target / name).unlink()
             for path in (result / "tests").iterdir():
                 os.replace(path, target / "tests" / path.name)
             finish_run(target)
@@ -236,6 +239,8 @@ class Results:
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(target, kept)
             os.replace(result, target)
+            if (log := self.unfinished(cell) / "log.txt").exists() and log.stat().st_size:  # warnings of resumptions
+                os.replace(log, target / log.name)
         folder = self.unfinished(cell)
         shutil.rmtree(folder, ignore_errors=True)
         for parent in folder.parents[: len(Path(cell.id).parts)]:

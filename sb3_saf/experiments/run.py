@@ -124,7 +124,8 @@ def run(
     """
     everything = expand(experiment, selection, config)
     results.check_experiment(experiment)
-    results.agree(config, everything)
+    before = [cell for one in results.selections(experiment.name) for cell in expand(experiment, one, config)]
+    results.agree(config, [*everything, *before])  # the report has all of them
     cells = shard.of(everything)
     todo = [cell for cell in cells if results.missing_tests(cell)]
     progress = _Progress(todo, config, results, engine, options or CellOptions())
@@ -220,6 +221,9 @@ class _Progress(AbstractContextManager["_Progress"]):
     def _end(self, attempt: Attempt, error: BaseException | None) -> str:
         """Store the result or the error of an attempt; return a line about it."""
         cell, count = attempt.cell, f"[{self.n_ended + 1}/{self._n_cells}]"
+        tests = self._results.unfinished(cell) / "result" / "tests"
+        if error is None and not all((tests / f"{level.slug}.json").exists() for level in cell.tests):
+            error = RuntimeError("the worker ended without results; does the game end its process?")
         if error is None:
             self._results.publish(cell)
             self.finished.append(cell)

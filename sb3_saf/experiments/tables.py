@@ -250,8 +250,11 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     :raises ValueError: if there are none, or their files could run code
     """
     rows: list[dict[str, Any]] = []
+    results = Results(folder)
     for path in sorted(folder.glob("*/selections")):
-        tests = read_results(folder, path.parent.name).tests
+        tests = frame_of_tests(results, requested(results.experiment(path.parent.name), results))
+        if tests.empty:
+            continue
         own = tests[(tests["game_steps"] > 0) & (tests["level"] == tests["train_level"])]
         rows += own.assign(experiment=path.parent.name).to_dict("records")
     best = {}

@@ -417,7 +417,7 @@ def find_team(name: str, folder: str | Path | None = None) -> Run:
     if name not in known:
         raise unknown_name("team", name, known)
     run = Run((TEAMS if folder is None else Path(folder)) / name)
-    if damage := run.damage(WEIGHTS):
+    if damage := run.damage(WEIGHTS) or run.damage(RUN_FILE):
         raise ExportError(f"{damage}; restore it from the repository: git checkout {run.folder}")
     check_runs_no_code(run.description["settings"], run.folder)
     return run
