@@ -221,8 +221,9 @@ class _Progress(AbstractContextManager["_Progress"]):
     def _end(self, attempt: Attempt, error: BaseException | None) -> str:
         """Store the result or the error of an attempt; return a line about it."""
         cell, count = attempt.cell, f"[{self.n_ended + 1}/{self._n_cells}]"
-        tests = self._results.unfinished(cell) / "result" / "tests"
-        if error is None and not all((tests / f"{level.slug}.json").exists() for level in cell.tests):
+        folder = self._results.unfinished(cell)
+        asked = [folder / "result" / "tests" / f"{level.slug}.json" for level in Job.read(folder).cell.tests]
+        if error is None and not all(path.exists() for path in asked):
             error = RuntimeError("the worker ended without results; does the game end its process?")
         if error is None:
             self._results.publish(cell)
@@ -243,6 +244,6 @@ class _Progress(AbstractContextManager["_Progress"]):
             self._waiting.append((cell, attempt.number + 1))
             return f"[{self.n_ended}/{self._n_cells}] {cell}: attempt {attempt.number} failed, trying again: {reason}"
         self.failed.append(cell)
-        path = self._results.unfinished(cell) / "error.txt"
+        path = folder / "error.txt"
         write_text(path, str(error))
         return f"{count} {cell}: FAILED: {reason}; see {path}"
