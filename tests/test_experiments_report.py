@@ -72,7 +72,7 @@ def test_the_page_has_all_figures_and_what_was_run(folder: Path, page: str) -> N
     assert "over 16 new games with drawn actions, the same for all methods of a seed" in page
     again = (
         "run coordination --size smoke --game-steps 80 --hyperparams n_epochs:1 --eval-freq 40 --eval-episodes 2 "
-        "--episodes 16 --seeds 0 1 --methods saf ippo --levels 1 2 --tasks TeamTogether TeamSupport"
+        "--episodes 16 --seeds 0 1 --methods saf ippo --levels 1 2 --tasks TeamTogether-v0 TeamSupport-v0"
     )
     assert f"python -m sb3_saf.experiments {again} -f {folder}" in page
     assert page.count("python -m sb3_saf.train --algo ") == 2 * len(LEVELS) * 2

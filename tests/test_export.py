@@ -259,7 +259,7 @@ def test_masks_of_maskable_ppo_are_optional(exports: Callable[[str], Exported]) 
 
 
 def test_an_actor_without_masks_refuses_one(exports: Callable[[str], Exported]) -> None:
-    with pytest.raises(ValueError, match="leave action_mask out"):
+    with pytest.raises(ValueError, match="without masks of actions: leave them out"):
         exports("own encoder").actor.act(np.zeros(5), action_mask=[1, 1, 1])
 
 

@@ -198,7 +198,7 @@ class Actor:
         takes_masks = description["action_mask"] != "none"
         given = given_by_game(form, observation, action_mask, takes_masks, self.agent)
         if given is not None:
-            return {"action_mask": given.action_masks if takes_masks else action_mask, **given.rows}, given
+            return {"action_mask": given.action_masks, **given.rows}, given
         if isinstance(observation, Mapping) and set(observation) == CLASSIC:
             action_mask = observation["action_mask"] if action_mask is None else action_mask
             observation = observation["observation"]
@@ -324,7 +324,7 @@ class Actor:
                 raise ValueError(f"this actor needs action_mask, {n_choices} zeros and ones for each observation")
             return None
         if use == "none":
-            raise ValueError("this actor was trained without masks of actions: leave action_mask out")
+            raise ValueError("this policy was trained without masks of actions: leave them out")
         mask = np.asarray(action_mask)
         mask = mask[np.newaxis] if mask.ndim == 1 else mask
         if mask.shape != (n_rows, n_choices) or not ((mask == 0) | (mask == 1)).all():

@@ -477,7 +477,7 @@ def given_by_game(
     :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
     """
     if action_masks is not None and not takes_masks:
-        raise ValueError("expected no action_masks, because this policy was trained without masks")
+        raise ValueError("this policy was trained without masks of actions: leave them out")
     infos: Mapping[Any, Any] = {}
     if isinstance(observation, tuple) and len(observation) == 2 and all(isinstance(x, Mapping) for x in observation):
         observation, infos = observation
