@@ -106,7 +106,9 @@ def test_masks_that_are_not_always_used_are_named(game: dict[str, Any], message:
     [
         ([spaces.Dict(view=spaces.Dict(x=BOX, action_mask=spaces.MultiBinary(3)))], "'action_mask' inside of 'view'"),
         ([spaces.Dict(view=CodeSpace(), energy=BOX)], "tile codes beside other entries"),
-        ([spaces.Box(0, 1000, (2,), np.int32), spaces.Box(0, 1, (2,), np.int32)], r"integers up to \[1.0, 1000.0\]"),
+        ([spaces.Box(0, 1000, (2,), np.int32), spaces.Box(0, 1, (2,), np.int32)], r"reach up to \[1.0, 1000.0\]"),
+        ([spaces.Box(-200, 0, (2,), np.int32), spaces.Box(-1, 1, (2,))], r"reach up to \[1.0, 200.0\]"),
+        ([spaces.Dict(x=spaces.Box(0, high, (2,))) for high in (255, 1)], r"reach up to \[1.0, 255.0\]"),
     ],
 )
 def test_observations_that_are_not_read_as_meant_are_named(observed: list[Any], message: str) -> None:

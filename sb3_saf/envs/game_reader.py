@@ -34,7 +34,7 @@ MakeEnv: TypeAlias = "Callable[[], AnyParallelEnv] | AnyParallelEnv"
 AskMasks: TypeAlias = Literal["auto"] | bool
 
 
-#: Ratio of the bounds of agents' integers that is warned of.
+#: Ratio of the bounds of agents' observations that is warned of.
 _UNEQUAL: Final = 10
 
 
@@ -75,14 +75,20 @@ class GameReader:
                 "tile codes beside other entries are read as plain numbers, without their pixels; give the agents the "
                 "codes alone, or pixels (HECOGrid: observation='rgb')"
             )
-        largest = {
-            float(box.high.max()) for box in own_spaces if isinstance(box, spaces.Box) and box.dtype.kind in "iu"
-        }
-        if len(largest) > 1 and max(largest) >= _UNEQUAL * min(largest):
-            self.notes.append(
-                f"the agents' observations are integers up to {sorted(largest)}, all of which encoders divide by the "
-                "bounds of the largest: they hardly see the small ones; scale observations to equal ranges in the game"
-            )
+        boxes: dict[tuple[Key, ...], list[spaces.Box]] = {}
+        for place, leaf in (entry for space in own_spaces for entry in innermost(space)):
+            if isinstance(leaf, spaces.Box):
+                boxes.setdefault(place, []).append(leaf)
+        for alike in boxes.values():
+            bounds = [(float(box.low.min()), float(box.high.max())) for box in alike]
+            largest = {max(abs(low), abs(high)) for low, high in bounds}
+            divided = (0.0, 255.0) in bounds or any(wide_integers(box).any() for box in alike)
+            if divided and np.inf > max(largest) >= _UNEQUAL * min(largest):
+                self.notes.append(
+                    f"the agents' observations reach up to {sorted(largest)} in one place, and encoders divide whole "
+                    "numbers, with what other agents have in their place, by the largest: they hardly see the small "
+                    "ones; scale observations to equal ranges in the game"
+                )
         #: Action space of a row.
         self.action_space = common_actions(acted)
         has_masks, needs_mask = self._find_masks(trial, action_masks)

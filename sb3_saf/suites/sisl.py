@@ -1,7 +1,8 @@
 """
 SISL's environments: ``sisl/pursuit_v5``, ``sisl/multiwalker_v9``.
 
-Time limits are truncations.
+Time limits are truncations in pursuit. Multiwalker terminates at ``max_cycles``, so ``time_limit="bootstrap"`` adds
+nothing there.
 """
 
 from __future__ import annotations
