@@ -430,7 +430,15 @@ class QPLEX(OffPolicyAlgorithm):
                 f"{type(self).__name__} does not train on VecNormalize, whose statistics change while steps are "
                 "stored; scale in games"
             )
-        rows = self._rows_until(0 if reset_num_timesteps else self.num_timesteps, total_timesteps)
+        begun = 0 if reset_num_timesteps else self.num_timesteps
+        rows = self._rows_until(begun, total_timesteps)
+        game_steps = (begun + rows) // self.n_agents
+        if game_steps <= self.learning_starts:
+            warnings.warn(
+                f"nothing is learned in {game_steps:,} game steps with learning_starts={self.learning_starts:,}; lower "
+                "it, or train longer",
+                stacklevel=2,
+            )
         name = tb_log_name or type(self).__name__
         return super().learn(rows, callback, log_interval, name, reset_num_timesteps, progress_bar)
 

@@ -529,8 +529,8 @@ def _agents_in(team: RowForm, observation: object) -> list[Any] | None:
             raise ValueError(f"expected observations of at most {team.n_agents} agents, got {len(agents)}")
         return agents
     raise ValueError(
-        f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, got "
-        f"{unknown[0]!r}"
+        f"expected observations of {', '.join(map(repr, names))}, the agents of the training environment, or one with "
+        f"all parts of an agent's, got {unknown[0]!r}"
     )
 
 
