@@ -39,7 +39,6 @@ def recorded(**changes: Any) -> EpisodeRecording:
         ends=np.array([[False] * 2, [False] * 2, [True] * 2]),
         last_values=np.zeros((3, 2), dtype=np.float32),
         values=np.zeros((3, 2), dtype=np.float32),
-        returns=np.zeros((3, 2)),
         values_without={},
         episode_returns=[15.0],
         episode_lengths=[3],

@@ -275,7 +275,6 @@ class EpisodeRecording(NamedTuple):
     :param ends: (T, B) whether the episode ended with this step, or the agent was bootstrapped before its team
     :param last_values: (T, B) value of the last observation at a time limit that is no true end, else 0
     :param values: (T, B)
-    :param returns: (T, B) discounted returns
     :param zones: (T, B), -1 for none; None if there are no zones
     :param pool_weights: (T, B, U) selection probability of each policy; None without a pool
     :param pool_actions: (T, B, U, P) parameters of each policy's action distribution, illegal actions masked; None
@@ -299,7 +298,6 @@ class EpisodeRecording(NamedTuple):
     ends: Bools
     last_values: Floats
     values: Floats
-    returns: Doubles
     episode_returns: list[float]
     episode_lengths: list[int]
     pictures: list[Picture]
@@ -318,10 +316,34 @@ class EpisodeRecording(NamedTuple):
         """Whether a game was in a recorded episode, (T, E)."""
         return np.any(self.counted.reshape(len(self.counted), -1, self.n_agents), axis=2)
 
+    @property
+    def returns(self) -> Doubles:
+        """Discounted returns, (T, B)."""
+        return self.targets(1.0)
+
     def targets(self, lam: float) -> Doubles:
-        """Compute the TD(lambda) targets of the critic, (T, B)."""
-        playing = None if self.of_team else self.counted
-        return lambda_returns(self.rewards, self.ends, self.last_values, self.values, self.gamma, lam, playing)
+        """
+        Compute TD(lambda) targets (T, B), from which the critic learns; with ``lam=1`` they are the discounted returns.
+
+        ::
+
+            R_t = r_t + gamma last_t                                          if the episode ends with step t
+            R_t = r_t + gamma ((1 - lam) V_{t+1} + lam R_{t+1})               otherwise
+
+        ``last`` is the value of the last observation if the time limit is no true end (``time_limit="bootstrap"``),
+        else 0. These are SB3's advantages by GAE plus values. Where an agent does not take part, V is what its rows
+        hold later, as in :class:`~sb3_saf.TeamRolloutBuffer`. Rows of unfinished episodes must be excluded.
+        """
+        targets: Doubles = np.zeros(self.rewards.shape)
+        values = np.asarray(self.values, dtype=np.float64)
+        ahead = next_value = np.zeros_like(values[0])
+        for t in reversed(range(len(targets))):
+            ends, reward = self.ends[t], self.rewards[t]
+            last, going_on = self.last_values[t], (1 - lam) * next_value + lam * ahead
+            ahead = targets[t] = reward + self.gamma * np.where(ends, last, going_on)
+            paid = reward + self.gamma * np.where(ends, last, next_value)
+            next_value = values[t] if self.of_team else np.where(self.counted[t], values[t], paid)
+        return targets
 
 
 @th.no_grad()
@@ -436,12 +458,10 @@ class _Recorder:
     def recording(self, gamma: float) -> EpisodeRecording:
         """Return the recording of all steps so far."""
         columns: dict[str, Any] = {name: np.stack(column) for name, column in self.columns.items()}
-        of_critic: dict[str, Any] = {name: columns[name] for name in ("rewards", "ends", "last_values", "values")}
         return EpisodeRecording(
             n_agents=self.n_agents,
             of_team=self.reader.of_team,
             gamma=gamma,
-            returns=lambda_returns(**of_critic, gamma=gamma),
             episode_returns=self.returns,
             episode_lengths=self.lengths,
             pictures=self.pictures,
@@ -470,42 +490,3 @@ def _last_values(reader: PolicyReader | QReader, ends: Bools, infos: list[dict[s
         tensors: Any = reader.policy.obs_to_tensor(obs)[0]
         values[rows] = reader.last_values(tensors, rows).cpu().numpy()
     return values
-
-
-def lambda_returns(
-    rewards: Floats,
-    ends: Bools,
-    last_values: Floats,
-    values: Floats,
-    gamma: float,
-    lam: float = 1.0,
-    playing: Bools | None = None,
-) -> Doubles:
-    """
-    Compute TD(lambda) targets, the training targets of the critic; with ``lam=1`` they are the discounted returns.
-
-    ::
-
-        R_t = r_t + gamma last_t                                          if the episode ends with step t
-        R_t = r_t + gamma ((1 - lam) V_{t+1} + lam R_{t+1})               otherwise
-
-    ``last`` is the value of the last observation if the time limit is no true end (``time_limit="bootstrap"``), else 0.
-    These are SB3's advantages by GAE plus values. Where an agent does not take part, V is what its rows hold later, as
-    in :class:`~sb3_saf.TeamRolloutBuffer`. Rows of unfinished episodes must be excluded.
-
-    :param rewards: (T, B)
-    :param ends: (T, B)
-    :param last_values: (T, B)
-    :param values: (T, B)
-    :param playing: (T, B) whether the agent takes part; None for always
-    :return: (T, B)
-    """
-    targets: Doubles = np.zeros(rewards.shape)
-    values = np.asarray(values, dtype=np.float64)
-    ahead = next_value = np.zeros_like(values[0])
-    for t in reversed(range(len(targets))):
-        going_on = (1 - lam) * next_value + lam * ahead
-        targets[t] = rewards[t] + gamma * np.where(ends[t], last_values[t], going_on)
-        paid = rewards[t] + gamma * np.where(ends[t], last_values[t], next_value)
-        ahead, next_value = targets[t], values[t] if playing is None else np.where(playing[t], values[t], paid)
-    return targets
