@@ -433,7 +433,7 @@ def test_critic_is_the_papers_chain() -> None:
     s_saf = critic.combine_net(th.cat([s, m], dim=2))
     assert isinstance(critic.value_head, nn.Module)
     expected = critic.value_head(s_saf.flatten(0, 1)).view(2, N_AGENTS)
-    th.testing.assert_close(critic(views, teams), expected, rtol=0, atol=1e-6)
+    th.testing.assert_close(critic.values(critic.states(views, teams)), expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("heads", ["shared", "per_agent"])

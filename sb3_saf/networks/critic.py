@@ -75,14 +75,6 @@ class TeamCritic(nn.Module, ABC):
         """
         return self.value_head.of_teams(states)
 
-    def forward(self, features: th.Tensor, teams: Rows, active: th.Tensor | None = None) -> th.Tensor:
-        """
-        Return the value of every agent of every team, without memory; arguments as in :meth:`states`.
-
-        :return: (G, N)
-        """
-        return self.values(self.states(features, teams, active))
-
 
 class OwnValueHead(nn.Module):
     """
