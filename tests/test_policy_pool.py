@@ -227,20 +227,20 @@ def make_pool(space: spaces.Space[Any], selection: Selection) -> PolicyPool:
 
 def test_selection_by_signature_keys() -> None:
     pool, features = make_pool(DISCRETE, "mixture"), th.randn(N_ROWS, 6)
-    output = pool.evaluate(features)
+    log_weights, actions = pool.evaluate(features)
     query = pool.query_net(features)
     logits = th.stack([(query * key).sum(dim=1) / 5**0.5 for key in pool.signature_keys], dim=1)
-    th.testing.assert_close(output.log_weights, logits.log_softmax(dim=1))
+    th.testing.assert_close(log_weights, logits.log_softmax(dim=1))
     for number, policy in enumerate(pool.policies):
-        th.testing.assert_close(output.actions[:, number], policy(features))
+        th.testing.assert_close(actions[:, number], policy(features))
 
 
 @pytest.mark.parametrize("space", SPACES)
 def test_gumbel_is_one_policy_at_a_time_and_its_mode_the_favourites(space: spaces.Space[Any]) -> None:
     pool, features = make_pool(space, "gumbel"), th.randn(N_ROWS, 6)
-    output, parameters = pool.evaluate(features), pool(features)
-    policies = [distribution_of(space, output.actions[:, number]) for number in range(4)]
-    favourite = output.log_weights.argmax(dim=1)
+    (log_weights, actions), parameters = pool.evaluate(features), pool(features)
+    policies = [distribution_of(space, actions[:, number]) for number in range(4)]
+    favourite = log_weights.argmax(dim=1)
     modes = th.stack([policy.mode() for policy in policies])[favourite, th.arange(N_ROWS)]
     action, seen = policies[0].sample(), set()
     by_policy = th.stack([policy.log_prob(action) for policy in policies], dim=1)

@@ -27,7 +27,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from sb3_saf.export import act
-from sb3_saf.networks.actor import PolicyPool, PoolOutput, SinglePolicy
+from sb3_saf.networks.actor import PolicyPool, SinglePolicy
 from sb3_saf.networks.distributions import (
     is_one_hot,
     likeliest_action,
@@ -261,12 +261,10 @@ class ActingNetwork(nn.Module):
         if self.memory is not None:
             features, after = self.memory.step(features, inputs["memory"])
             states.append(after)
-        output = self.actor.evaluate(features, inputs["agent"] if self.actor.reads_agent else None)
+        log_weights, parameters = self.actor.evaluate(features, inputs["agent"] if self.actor.reads_agent else None)
         if "action_mask" in inputs:
-            output = output._replace(
-                actions=masked_parameters(self.action_space, output.actions, inputs["action_mask"])
-            )
-        favourite = policy_parameters(output.actions, output.log_weights.argmax(dim=1))
+            parameters = masked_parameters(self.action_space, parameters, inputs["action_mask"])
+        favourite = policy_parameters(parameters, log_weights.argmax(dim=1))
         if self.greedy:
             best = favourite.argmax(dim=1)
             if isinstance(self.memory, AgentMemory):
@@ -275,15 +273,17 @@ class ActingNetwork(nn.Module):
         is_mixture = isinstance(self.actor, PolicyPool) and self.actor.selection == "mixture"
         likeliest = likeliest_action(self.action_space, favourite)
         if is_mixture:
-            likeliest = mixture_mode(self.action_space, *output)
-        log_prob = mixture_log_prob(self.action_space, *output, inputs["action"])
-        log_probs = [mixture_log_probs(*output)] if isinstance(self.action_space, spaces.Discrete) else []
-        return self._in_space(likeliest), self._in_space(self._drawn(output, inputs)), log_prob, *log_probs, *states
+            likeliest = mixture_mode(self.action_space, log_weights, parameters)
+        drawn = self._drawn(log_weights, parameters, inputs)
+        log_prob = mixture_log_prob(self.action_space, log_weights, parameters, inputs["action"])
+        is_discrete = isinstance(self.action_space, spaces.Discrete)
+        log_probs = [mixture_log_probs(log_weights, parameters)] if is_discrete else []
+        return self._in_space(likeliest), self._in_space(drawn), log_prob, *log_probs, *states
 
-    def _drawn(self, output: PoolOutput, inputs: Tensors) -> th.Tensor:
+    def _drawn(self, log_weights: th.Tensor, of_policies: th.Tensor, inputs: Tensors) -> th.Tensor:
         """Sample (rows, D) as the argmax of parameters plus noise: first the policy, then its choices."""
-        policy = (output.log_weights + inputs["gumbel_policy"]).argmax(dim=1)
-        parameters, noise = policy_parameters(output.actions, policy), inputs[f"{self.noise}_action"]
+        policy = (log_weights + inputs["gumbel_policy"]).argmax(dim=1)
+        parameters, noise = policy_parameters(of_policies, policy), inputs[f"{self.noise}_action"]
         if isinstance(self.action_space, spaces.Box):
             mean, log_std = parameters.chunk(2, dim=1)
             return mean + noise * log_std.exp()

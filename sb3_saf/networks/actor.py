@@ -5,14 +5,14 @@ Actors: networks from the features of an agent's own observation to its action d
 IPPO and MAPPO use a :class:`SinglePolicy`, SAF a :class:`PolicyPool`: policies that all agents share, selected by
 signature keys (arXiv 2210.03022, section 5).
 
-Letters: K rows, U policies, d features, P parameters of one policy's action distribution.
+Letters: K rows, U policies, d features, A actions, P parameters of one policy's action distribution.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, cast
+from typing import Literal, cast
 
 import torch as th
 from gymnasium import spaces
@@ -35,18 +35,6 @@ ACTION_GAIN = 0.01
 
 #: Action distribution of the pool: the exact mixture of its policies, or one policy drawn at every evaluation.
 Selection = Literal["mixture", "gumbel"]
-
-
-class PoolOutput(NamedTuple):
-    """
-    Selection weights and action parameters of the policies of a pool.
-
-    :param log_weights: (K, U), normalised
-    :param actions: (K, U, P), parameters of each policy's action distribution; rows are the last axis in memory
-    """
-
-    log_weights: th.Tensor
-    actions: th.Tensor
 
 
 class ActionHead(nn.Module):
@@ -104,13 +92,11 @@ class ActorNetwork(nn.Module, ABC):
         """
 
     @abstractmethod
-    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
-        Evaluate every policy and its weight; a single policy has weight 1.
+        Evaluate every policy and its weight, with arguments as in :meth:`forward`; a single policy has weight 1.
 
-        :param features: (K, d) features of own observations
-        :param agent: (K,) int64 index of the agent, where ``reads_agent``
-        :return: log weights (K, U) and action parameters (K, U, P)
+        :return: normalised log weights (K, U) and the parameters of each policy's action distribution (K, U, P)
         """
 
     def with_identity(self, features: th.Tensor, agent: th.Tensor | None) -> th.Tensor:
@@ -130,11 +116,9 @@ class ActorNetwork(nn.Module, ABC):
 
     def unmixed(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
         """
-        Return the parameters of every policy, to which action masks must be applied before mixing.
+        Return the parameters of every policy (K, P''), to which action masks must be applied before mixing.
 
-        :param features: (K, d) features of own observations
-        :param agent: (K,) int64 index of the agent, where ``reads_agent``
-        :return: (K, P'')
+        Arguments are those of :meth:`forward`.
         """
         return self(features, agent)
 
@@ -173,9 +157,9 @@ class SinglePolicy(ActorNetwork):
             return self.head(features, agent)
         return self.head(self.with_identity(features, agent))
 
-    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """See :class:`ActorNetwork`; (K, 1) log weights of zero and (K, 1, P) parameters."""
-        return PoolOutput(th.zeros_like(features[:, :1]), self(features, agent).unsqueeze(1))
+        return th.zeros_like(features[:, :1]), self(features, agent).unsqueeze(1)
 
 
 class PolicyPool(ActorNetwork):
@@ -215,8 +199,8 @@ class PolicyPool(ActorNetwork):
         self.signature_keys = nn.Parameter(th.randn(n_policies, latent_dim))
         self.policies = nn.ModuleList(ActionHead(spec, self.n_identities) for _ in range(n_policies))
 
-    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> PoolOutput:
-        """See :class:`ActorNetwork`."""
+    def evaluate(self, features: th.Tensor, agent: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+        """See :class:`ActorNetwork`; rows are the last axis of the parameters in memory."""
         features = self.with_identity(features, agent)
         policies = [cast(ActionHead, policy) for policy in self.policies]
         (queries,), actions = side_by_side([[self.query_net], [policy.net for policy in policies]], features)
@@ -224,16 +208,10 @@ class PolicyPool(ActorNetwork):
         if isinstance(self.action_space, spaces.Box):
             log_stds = th.stack([cast(nn.Parameter, policy.log_std) for policy in policies])
             actions = th.cat([actions, log_stds.unsqueeze(1).expand_as(actions)], dim=2)
-        return PoolOutput(logits.log_softmax(dim=0).t(), actions.transpose(0, 1))
+        return logits.log_softmax(dim=0).t(), actions.transpose(0, 1)
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
-        """
-        See :class:`ActorNetwork`.
-
-        :param features: (K, d)
-        :param agent: (K,) int64 index of the agent, where ``reads_agent``
-        :return: (K, n) log-probabilities of a discrete mixture, or (K, U + U P) weights and parameters
-        """
+        """See :class:`ActorNetwork`; (K, A) log-probabilities of a discrete mixture, or as :meth:`unmixed`."""
         if self.is_categorical_mixture:
             return mixture_log_probs(*self.evaluate(features, agent))
         return self.unmixed(features, agent)

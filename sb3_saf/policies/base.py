@@ -26,7 +26,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_saf.buffers.rollout import LaterValues, Step, TeamMinibatch, TeamRolloutBuffer
-from sb3_saf.networks.actor import ActionHead, ActorNetwork, PoolOutput
+from sb3_saf.networks.actor import ActionHead, ActorNetwork
 from sb3_saf.networks.critic import StateCritic, TeamCritic, ValueNormalizer
 from sb3_saf.networks.distributions import masked_parameters
 from sb3_saf.networks.encoders import ObservationEncoder
@@ -371,7 +371,9 @@ class TeamPolicy(RememberingPolicy):
         allowed = allowed.reshape(-1, allowed.shape[-1])
         return allowed if masks is None else masks & allowed
 
-    def evaluate_pool(self, obs: PyTorchObs, latent: th.Tensor, action_masks: Masks | None = None) -> PoolOutput:
+    def evaluate_pool(
+        self, obs: PyTorchObs, latent: th.Tensor, action_masks: Masks | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         Return weights and parameters of the policies; a single policy is a pool of one.
 
@@ -380,11 +382,11 @@ class TeamPolicy(RememberingPolicy):
         :param action_masks: (B, M) of MaskablePPO; None allows everything
         :return: log weights (B, U) and parameters (B, U, P), illegal actions masked
         """
-        output = self.actor.evaluate(latent, self._agent(obs) if self.actor.reads_agent else None)
+        log_weights, parameters = self.actor.evaluate(latent, self._agent(obs) if self.actor.reads_agent else None)
         legal = self._legal(obs, action_masks, latent.device)
-        if legal is None:
-            return output
-        return output._replace(actions=masked_parameters(self.action_space, output.actions, legal))
+        if legal is not None:
+            parameters = masked_parameters(self.action_space, parameters, legal)
+        return log_weights, parameters
 
     def _values(self, obs: PyTorchObs, encoded: Encoded) -> th.Tensor:
         """Return values (B, 1)."""
