@@ -73,8 +73,8 @@ def test_compiled_attention_is_attention(queries: th.Tensor, masked: bool, of_we
 
     def attend(queries: th.Tensor, sources: th.Tensor) -> th.Tensor:
         module = single if queries.dtype == th.float32 else copy.deepcopy(single).double()  # double is not compiled
-        attended = module(queries, sources, active)
-        return attended.weights if of_weights else attended.values
+        values, weights = module(queries, sources, active)
+        return weights if of_weights else values
 
     found, expected = gradients(attend, queries, sources), gradients(attend, queries.double(), sources.double())
     for one, other in zip(found, expected, strict=True):
@@ -140,7 +140,7 @@ def test_a_training_repeats_on_two_threads(algorithm: type[Any], policy: str, kw
     ids=["linear", "convolution"],
 )
 def test_gradients_of_first_and_second_order(places: Places) -> None:
-    views = used_codes(th.randint(11, (3, 6))).views
+    _, views = used_codes(th.randint(11, (3, 6)))
     table = th.randn(int(views.max()) + 1, int(places.way.max()) + 1, 2, dtype=th.float64, requires_grad=True)
     bias = th.randn(2, dtype=th.float64, requires_grad=True)
 

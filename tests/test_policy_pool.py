@@ -366,11 +366,11 @@ def test_agrees_with_an_independent_account(source: KnowledgeSource) -> None:
         nn.init.normal_(parameter, std=0.5)
     source = source.double()
     messages, states = random_team().double(), random_team().double()
-    written, read = source.write(messages), source(messages, states).read
+    (written, weights), read = source.write(messages), source(messages, states).read
     for team in range(N_TEAMS):
         slots, attention, answers = reference(source, messages[team].numpy(), states[team].numpy())
-        np.testing.assert_allclose(written.values[team].detach().numpy(), slots, rtol=1e-9)
-        np.testing.assert_allclose(written.weights[team].detach().numpy(), attention, rtol=1e-9)
+        np.testing.assert_allclose(written[team].detach().numpy(), slots, rtol=1e-9)
+        np.testing.assert_allclose(weights[team].detach().numpy(), attention, rtol=1e-9)
         np.testing.assert_allclose(read[team].detach().numpy(), answers, rtol=1e-9)
 
 
@@ -380,16 +380,16 @@ def test_agrees_with_an_independent_account(source: KnowledgeSource) -> None:
 def test_inactive_agents_are_not_heard(source: KnowledgeSource) -> None:
     messages, active = random_team(), th.ones(N_TEAMS, N_AGENTS, dtype=th.bool)
     active[0, 2] = active[1, :4] = False
-    written = source.write(messages, active)
-    assert (written.weights.transpose(1, 2)[~active] == 0).all()
-    th.testing.assert_close(written.weights.sum(dim=2), th.ones(N_TEAMS, 4))
+    written, weights = source.write(messages, active)
+    assert (weights.transpose(1, 2)[~active] == 0).all()
+    th.testing.assert_close(weights.sum(dim=2), th.ones(N_TEAMS, 4))
     changed = messages.clone()
     changed[~active] = 1e3
-    assert th.equal(source.write(changed, active).values, written.values)
+    assert th.equal(source.write(changed, active)[0], written)
     # A team of only the active agents writes the same.
     alone = KnowledgeSource(4, SIZE)
     alone.load_state_dict(source.state_dict() | {"agent_embeddings": source.agent_embeddings[[0, 1, 3, 4]]})
-    th.testing.assert_close(alone.write(messages[:1, [0, 1, 3, 4]]).values, written.values[:1], rtol=0, atol=1e-6)
+    th.testing.assert_close(alone.write(messages[:1, [0, 1, 3, 4]])[0], written[:1], rtol=0, atol=1e-6)
 
 
 def test_a_team_without_active_agents_gives_numbers(source: KnowledgeSource) -> None:

@@ -215,7 +215,7 @@ class QReader:
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """See :class:`PolicyReader`."""
         state = None if self._state is None else tuple(part[rows] for part in self._state)
-        return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state).values)
+        return greedy_q_tot(self.policy, obs, self.policy.evaluate(obs, state)[0])
 
 
 Floats = npt.NDArray[np.float32]

@@ -287,9 +287,9 @@ class PaperCNN(Encoder):
             return self.net(self.border(self.pixels(observations)))
         first = self.net[0]
         assert isinstance(first, nn.Conv2d) and first.bias is not None
-        used = used_codes(observations.flatten(1))
-        table = table_of_convolution(self.pixels.tiles(used.codes), first.weight, stride=2)
-        return self.net[2:](rectified_sums(used.views, table, first.bias, self._places))
+        codes, views = used_codes(observations.flatten(1))
+        table = table_of_convolution(self.pixels.tiles(codes), first.weight, stride=2)
+        return self.net[2:](rectified_sums(views, table, first.bias, self._places))
 
 
 class NatureEncoder(Encoder):
@@ -389,12 +389,12 @@ class LightEncoder(Encoder):
         if self.pixels.looks_up(observations):
             first = self.net[0]
             assert isinstance(first, nn.Linear)
-            used = used_codes(observations.flatten(1))
-            embedded = self.embed(self.tile_inputs[used.codes])
+            codes, views = used_codes(observations.flatten(1))
+            embedded = self.embed(self.tile_inputs[codes])
             # Weights are (hidden, T * e); contributions of a code at each of the T places are (U, T, hidden).
             by_tile = first.weight.unflatten(1, (-1, embedded.shape[1])).permute(2, 1, 0)
             table = (embedded @ by_tile.flatten(1)).unflatten(1, by_tile.shape[1:])
-            return self.net[2:](rectified_sums(used.views, table, first.bias, self._places))
+            return self.net[2:](rectified_sums(views, table, first.bias, self._places))
         if self.pixels.layout == "codes":
             tiles = nn.functional.embedding(observations.long().flatten(1), self.embed(self.tile_inputs))
         else:

@@ -27,18 +27,6 @@ Floats = npt.NDArray[np.float32]
 _FAST: Final = {"contract", "reassoc", "nsz"}
 
 
-class Attended(NamedTuple):
-    """
-    Output of an attention layer.
-
-    :param values: (G, Q, d)
-    :param weights: (G, Q, S), weight of each source for each query; sums to 1 over sources
-    """
-
-    values: th.Tensor
-    weights: th.Tensor
-
-
 class Attention(nn.Module):
     """
     One head of scaled dot-product attention: softmax(Q K^T / sqrt(d)) V, then a linear output layer.
@@ -55,19 +43,21 @@ class Attention(nn.Module):
         self.out = Linear(features_dim, features_dim, gain=1.0)
         self.scale = features_dim**-0.5
 
-    def forward(self, queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None = None) -> Attended:
+    def forward(
+        self, queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         Attend to the sources.
 
         :param queries: (G, Q, d), or (Q, d) that are the same for all G
         :param sources: (G, S, d)
         :param active: (G, S) bool, sources to attend to; all if None. Without any active source the values are zero
-        :return: values (G, Q, d), with the output layer applied, and weights (G, Q, S)
+        :return: values (G, Q, d), with the output layer applied, and weights (G, Q, S), which sum to 1 over sources
         """
         queries = queries @ ((self.query.weight.t() * self.scale) @ self.key.weight)
         on_cpu = sources.device.type == "cpu" and sources.dtype == th.float32 and not th.compiler.is_compiling()
         taken, weights = _Taken.apply(queries, sources, active) if on_cpu else _taken(queries, sources, active)
-        return Attended(nn.functional.linear(taken, self.out.weight @ self.value.weight, self.out.bias), weights)
+        return nn.functional.linear(taken, self.out.weight @ self.value.weight, self.out.bias), weights
 
 
 def _taken(queries: th.Tensor, sources: th.Tensor, active: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
@@ -204,7 +194,7 @@ class CrossAttentionBlock(nn.Module):
         self.mlp_norm = nn.LayerNorm(features_dim)
         self.mlp = mlp([features_dim] * 3, nn.GELU)
 
-    def forward(self, slots: th.Tensor, messages: th.Tensor, active: th.Tensor | None) -> Attended:
+    def forward(self, slots: th.Tensor, messages: th.Tensor, active: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
         """
         Update the slots.
 
@@ -213,9 +203,9 @@ class CrossAttentionBlock(nn.Module):
         :param active: (G, N) bool or None
         :return: slots (G, L, d) and attention (G, L, N)
         """
-        attended = self.attention(self.query_norm(slots), self.source_norm(messages), active)
-        slots = slots + attended.values
-        return Attended(slots + self.mlp(self.mlp_norm(slots)), attended.weights)
+        values, weights = self.attention(self.query_norm(slots), self.source_norm(messages), active)
+        slots = slots + values
+        return slots + self.mlp(self.mlp_norm(slots)), weights
 
 
 class SelfAttentionBlock(nn.Module):
@@ -236,7 +226,7 @@ class SelfAttentionBlock(nn.Module):
         :return: (G, L, d)
         """
         normed = self.norm(slots)
-        slots = slots + self.attention(normed, normed).values
+        slots = slots + self.attention(normed, normed)[0]
         return slots + self.mlp(self.mlp_norm(slots))
 
 
@@ -245,26 +235,25 @@ class KnowledgeSource(nn.Module):
     Slots that attend to the agents' messages (write) and that agents attend to (read).
 
     Writing costs L x N and reading N x L: linear in the number of agents. A learned embedding marks the sender of a
-    message; apart from that, the order of agents does not matter.
+    message; apart from that, the order of agents does not matter. After writing, slots attend to each other twice.
 
     :param features_dim: d of messages, states and slots
     :param n_slots: L
-    :param n_self_attention: number of self-attention blocks after writing
     """
 
-    def __init__(self, n_agents: int, features_dim: int = 64, n_slots: int = 4, n_self_attention: int = 2):
+    def __init__(self, n_agents: int, features_dim: int = 64, n_slots: int = 4):
         super().__init__()
         self.agent_embeddings = nn.Parameter(th.randn(n_agents, features_dim) * features_dim**-0.5)
         # Orthogonal, and as large as the normed values that writing adds: smaller slots would all become the mean of
         # the messages, which makes reading from them indistinguishable.
         self.slots = nn.Parameter(nn.init.orthogonal_(th.empty(n_slots, features_dim), gain=features_dim**0.5))
         self.write_block = CrossAttentionBlock(features_dim)
-        self.slot_blocks = nn.ModuleList(SelfAttentionBlock(features_dim) for _ in range(n_self_attention))
+        self.slot_blocks = nn.ModuleList(SelfAttentionBlock(features_dim) for _ in range(2))
         self.read_query_norm = nn.LayerNorm(features_dim)
         self.read_source_norm = nn.LayerNorm(features_dim)
         self.read_attention = Attention(features_dim)
 
-    def write(self, messages: th.Tensor, active: th.Tensor | None = None) -> Attended:
+    def write(self, messages: th.Tensor, active: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
         Fill the slots.
 
@@ -275,16 +264,14 @@ class KnowledgeSource(nn.Module):
         slots, attention = self.write_block(self.slots, messages + self.agent_embeddings, active)
         for block in self.slot_blocks:
             slots = block(slots)
-        return Attended(slots, attention)
+        return slots, attention
 
     def forward(self, messages: th.Tensor, states: th.Tensor, active: th.Tensor | None = None) -> Exchanged:
         """
-        Write, then read from the slots with the agents' states as queries.
+        Write as in :meth:`write`, then read from the slots with the agents' states as queries.
 
-        :param messages: (G, N, d), m' of every agent
         :param states: (G, N, d), s of every agent
-        :param active: (G, N) bool, agents whose messages are written; all if None
         """
         slots, written = self.write(messages, active)
-        read = self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
-        return Exchanged(read.values, written, read.weights)
+        read, looked = self.read_attention(self.read_query_norm(states), self.read_source_norm(slots))
+        return Exchanged(read, written, looked)

@@ -41,18 +41,6 @@ class Places(NamedTuple):
     way: Ints
 
 
-class UsedCodes(NamedTuple):
-    """
-    Codes that occur in a batch of views.
-
-    :param codes: (U,) int64, increasing
-    :param views: (K, T) int64, index of each tile's code in ``codes``
-    """
-
-    codes: th.Tensor
-    views: th.Tensor
-
-
 def places_of_linear(n_tiles: int) -> Places:
     """Return the places of a linear layer: a single place with every tile, each in its own way."""
     tiles = np.arange(n_tiles)
@@ -101,11 +89,12 @@ def table_of_convolution(pictures: th.Tensor, weight: th.Tensor, stride: int) ->
     return th.nn.functional.conv2d(alone, weight, stride=stride).flatten(2).transpose(1, 2)
 
 
-def used_codes(views: th.Tensor) -> UsedCodes:
+def used_codes(views: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """
     Find the codes that occur, and index the views by them.
 
     :param views: (K, T) codes of any type on the CPU
+    :return: codes (U,) int64, increasing, and the index in them of each tile's code, (K, T) int64
     """
     array = (views.long() if views.is_floating_point() else views).numpy()
     seen = np.zeros(int(array.max()) + 1 if array.size else 0, dtype=np.bool_)
@@ -113,7 +102,7 @@ def used_codes(views: th.Tensor) -> UsedCodes:
     codes = np.flatnonzero(seen)
     number = np.zeros(len(seen), dtype=np.int64)
     number[codes] = np.arange(len(codes))
-    return UsedCodes(th.from_numpy(codes), th.from_numpy(number[array]))
+    return th.from_numpy(codes), th.from_numpy(number[array])
 
 
 def rectified_sums(views: th.Tensor, table: th.Tensor, bias: th.Tensor, places: Places) -> th.Tensor:

@@ -175,20 +175,6 @@ class QNetworks(NamedTuple):
     state_encoder: nn.Module | None
 
 
-class Evaluated(NamedTuple):
-    """
-    Result of one step of the agents' networks.
-
-    :param values: (B, A) Q_i of every action, -inf for illegal ones
-    :param latents: (B, H) inputs of the heads
-    :param state: next recurrent state if each agent takes its best action; None without memory
-    """
-
-    values: th.Tensor
-    latents: th.Tensor
-    state: State | None
-
-
 class QPLEXPolicy(TeamRowsPolicy):
     """
     Policy of QPLEX, QMIX and VDN.
@@ -373,15 +359,17 @@ class QPLEXPolicy(TeamRowsPolicy):
 
     def evaluate(
         self, obs: PyTorchObs, state: State | None = None, episode_start: np.ndarray | None = None
-    ) -> Evaluated:
+    ) -> tuple[th.Tensor, th.Tensor, State | None]:
         """
         Evaluate the agents' networks for one step; ``episode_start`` as in ``predict``.
 
         :param obs: rows, or only own observations
+        :return: Q_i of every action (B, A), -inf for illegal ones; inputs of the heads (B, H); the state after the
+            step if each agent takes its best action, None without memory
         """
         net, features = self.actor_memory, self.encode_own(obs).of_rows()
         if net is None:
-            return Evaluated(self.own_q_values(obs), features, None)
+            return self.own_q_values(obs), features, None
         if state is None:
             starts = th.ones(len(features), dtype=th.bool, device=features.device)
             memory = features.new_zeros(len(features), net.state_dim)
@@ -393,7 +381,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         inputs = net.inputs(features, last.long().masked_fill(starts, -1), agent)
         latents, memory = net.step(inputs, memory, starts)
         values = q_values(self.actor, latents, agent, self._action_mask(obs))
-        return Evaluated(values, latents, (memory.cpu().numpy(), values.argmax(dim=1).cpu().numpy()))
+        return values, latents, (memory.cpu().numpy(), values.argmax(dim=1).cpu().numpy())
 
     def team_steps(self, obs: dict[str, th.Tensor]) -> TeamSteps:
         """Return the mixer's inputs from rows of whole teams, game-major."""
