@@ -27,14 +27,7 @@ RELEASED_ONLY: Final = {"variational bottleneck": 125_216, "extra attention proj
 
 
 class TableRow(NamedTuple):
-    """
-    One line of the table.
-
-    :param name: the model
-    :param counted: parameters of our model
-    :param paper: the paper's number, None if it has none
-    :param made_of: the parts
-    """
+    """One line of the table: our model's number of parameters, and the paper's, None if it has none."""
 
     name: str
     counted: int

@@ -77,11 +77,7 @@ class TeamCritic(nn.Module, ABC):
 
 
 class OwnValueHead(nn.Module):
-    """
-    Value of an agent from its own features.
-
-    :param heads: one head for all agents, or one for each
-    """
+    """Value of an agent from its own features."""
 
     def __init__(self, spec: NetworkSpec, features_dim: int, heads: Heads):
         super().__init__()
@@ -124,7 +120,6 @@ class JointValueHead(nn.Module):
     With one head per agent the index selects the head.
 
     :param joint_dim: size of the joint features
-    :param heads: one head for all agents, or one for each
     :param agent_identity: whether a shared head reads the agent's index
     """
 
@@ -164,7 +159,6 @@ class StateCritic(nn.Module):
     V_i from the encoded state of the game.
 
     :param spec: spec of the policy; an encoded state is as large as an encoded observation
-    :param heads: one head for all agents, or one for each
     :param agent_identity: whether a shared head reads the agent's index
     :raises ValueError: if rows have no state, or the critic is to have a memory
     """

@@ -89,12 +89,7 @@ def masked_parameters(action_space: spaces.Space[Any], parameters: th.Tensor, ma
 
 
 def likeliest_action(action_space: spaces.Space[Any], parameters: th.Tensor) -> th.Tensor:
-    """
-    Return the most likely action of one policy per row.
-
-    :param parameters: (B, P)
-    :return: (B, D)
-    """
+    """Return the most likely actions (B, D) of one policy per row, from parameters (B, P)."""
     if isinstance(action_space, spaces.Box):
         return parameters.chunk(2, dim=-1)[0]
     if isinstance(action_space, spaces.MultiBinary):
@@ -108,12 +103,7 @@ def split_by_dimension(action_space: spaces.Space[Any], parameters: th.Tensor) -
 
 
 def distribution_of(action_space: spaces.Space[Any], parameters: th.Tensor) -> Distribution:
-    """
-    Make SB3's distribution of a single policy.
-
-    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
-    :param parameters: (B, P)
-    """
+    """Make SB3's distribution of a single policy from parameters (B, P)."""
     if isinstance(action_space, spaces.Discrete):
         return LeanCategorical(int(action_space.n)).proba_distribution(parameters)
     distribution: Any = make_proba_distribution(action_space)
@@ -197,13 +187,7 @@ _ENUMERATED_AT_ONCE: Final = 1 << 22
 
 
 def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
-    """
-    Return the parameters of one policy per row.
-
-    :param parameters: (B, U, P)
-    :param policy: (B,) index of a policy
-    :return: (B, P)
-    """
+    """Return the parameters (B, P) of one policy per row, with indices (B,), from those of the pool (B, U, P)."""
     # shape[0], not len(), here and elsewhere: it stays dynamic in exported graphs.
     return parameters[th.arange(policy.shape[0], device=policy.device), policy]
 
@@ -211,14 +195,7 @@ def policy_parameters(parameters: th.Tensor, policy: th.Tensor) -> th.Tensor:
 def mixture_log_prob(
     action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor, actions: th.Tensor
 ) -> th.Tensor:
-    """
-    Return the exact log-likelihood of a mixture: log sum_u w_u pi_u(a).
-
-    :param log_weights: (B, U)
-    :param parameters: (B, U, P)
-    :param actions: (B, D)
-    :return: (B,)
-    """
+    """Return the exact log-likelihoods (B,) of actions (B, D) under a mixture: log sum_u w_u pi_u(a)."""
     actions = actions.reshape(parameters.shape[0], 1, -1)
     if isinstance(action_space, spaces.Box):
         mean, log_std = parameters.chunk(2, dim=-1)
@@ -235,20 +212,18 @@ def mixture_log_prob(
     return (log_weights + of_dimensions.sum(dim=2)).logsumexp(dim=1)
 
 
-def draw_policy(log_weights: th.Tensor, actions: th.Tensor) -> th.Tensor:
+def draw_policy(log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
     """
     Draw one policy per row by its weight, with straight-through gradients to the weights.
 
-    :param log_weights: (B, U)
-    :param actions: (B, U, P)
     :return: (B, P), bit for bit the parameters of the drawn policy
     """
     uniform = th.rand_like(log_weights).clamp_min(th.finfo(log_weights.dtype).tiny)
     noisy = log_weights - (-uniform.log()).log()
     soft = noisy.softmax(dim=1)
     # Zero in value; its gradient is that of the soft choice.
-    straight_through = ((soft - soft.detach()).unsqueeze(2) * actions.detach()).sum(dim=1)
-    return policy_parameters(actions, noisy.argmax(dim=1)) + straight_through
+    straight_through = ((soft - soft.detach()).unsqueeze(2) * parameters.detach()).sum(dim=1)
+    return policy_parameters(parameters, noisy.argmax(dim=1)) + straight_through
 
 
 def is_enumerable(action_space: spaces.Space[Any]) -> bool:
@@ -258,13 +233,7 @@ def is_enumerable(action_space: spaces.Space[Any]) -> bool:
 
 
 def mixture_mode(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-    """
-    Return a mixture's most likely action, or that of its likeliest policy if actions cannot be enumerated.
-
-    :param log_weights: (B, U)
-    :param parameters: (B, U, P)
-    :return: (B, D)
-    """
+    """Return a mixture's most likely actions (B, D), or its likeliest policy's if they cannot be enumerated."""
     if not is_enumerable(action_space):
         return likeliest_action(action_space, policy_parameters(parameters, log_weights.argmax(dim=1)))
     best = _over_joint_actions(action_space, log_weights, parameters, lambda joint: joint.argmax(dim=1))
@@ -307,13 +276,7 @@ def _joint_log_probs(action_space: spaces.Space[Any], parameters: th.Tensor) -> 
 
 
 def mixture_of(action_space: spaces.Space[Any], log_weights: th.Tensor, parameters: th.Tensor) -> Distribution:
-    """
-    Make the exact mixture of a pool of policies: pi(a|o) = sum_u w_u(o) pi_u(a|o).
-
-    :param action_space: Discrete, MultiDiscrete, MultiBinary or Box
-    :param log_weights: (B, U), normalised
-    :param parameters: (B, U, P)
-    """
+    """Make the exact mixture of a pool of policies: pi(a|o) = sum_u w_u(o) pi_u(a|o)."""
     if isinstance(action_space, spaces.Discrete):
         return LeanCategorical(int(action_space.n)).of_log_probs(mixture_log_probs(log_weights, parameters))
     return PoolDistribution(action_space).proba_distribution(log_weights, parameters)

@@ -19,12 +19,7 @@ from sb3_saf.policies.parts import AlgorithmSpec, Declaration, PaperTable, TeamP
 
 
 class OwnCritic(TeamCritic):
-    """
-    V_i from the memory of z_i, of all agents of a team at once.
-
-    :param spec: of the policy, with a memory
-    :param heads: one head for all agents, or one for each
-    """
+    """V_i from the memory of z_i, of all agents of a team at once; ``spec`` has a memory."""
 
     def __init__(self, spec: NetworkSpec, heads: Heads):
         super().__init__(spec, spec.n_agents, spec.features_dim)

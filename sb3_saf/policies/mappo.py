@@ -29,12 +29,7 @@ from sb3_saf.teams.checks import check_choice
 
 
 class JointCritic(TeamCritic):
-    """
-    V_i from the concatenated features of all agents, [z_1, ..., z_N].
-
-    :param spec: of the policy
-    :param parts: ``heads`` and ``agent_identity``
-    """
+    """V_i from the concatenated features of all agents, [z_1, ..., z_N]."""
 
     def __init__(self, spec: NetworkSpec, parts: MAPPOParts):
         super().__init__(spec, 1, spec.n_agents * spec.features_dim)
@@ -49,12 +44,7 @@ class JointCritic(TeamCritic):
 
 
 class MeanCritic(TeamCritic):
-    """
-    V_i from an agent's own features and the mean of those of its team, [z_i, 1/N sum_j z_j], for any number of agents.
-
-    :param spec: of the policy
-    :param heads: one head for all agents, or one for each
-    """
+    """V_i from an agent's own features and their mean over the team, [z_i, 1/N sum_j z_j], for teams of any size."""
 
     def __init__(self, spec: NetworkSpec, heads: Heads):
         super().__init__(spec, spec.n_agents, 2 * spec.features_dim)
