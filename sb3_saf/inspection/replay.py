@@ -33,7 +33,6 @@ from sb3_saf.teams.vec_env import agent_names, layers, require_n_agents
 MAX_STEPS: Final = 2000
 #: Scale of fractions from 0 to 1 stored as 16-bit integers.
 _SHARE: Final = 65535
-_KINDS: Final = {"u1": np.uint8, "u2": np.uint16, "i2": np.int16, "f4": np.float32}
 
 Player: TypeAlias = "BaseAlgorithm | BasePolicy"
 Packed = dict[str, Any]
@@ -203,5 +202,5 @@ def _packed(array: npt.ArrayLike, kind: str, scale: float = 1) -> Packed:
     numbers = np.asarray(array)
     if kind != "f4":
         numbers = np.rint(numbers)
-    data = np.ascontiguousarray(numbers.astype(np.dtype(_KINDS[kind]).newbyteorder("<"))).tobytes()
+    data = numbers.astype(f"<{kind}").tobytes()
     return {"type": kind, "shape": list(numbers.shape), "scale": scale, "data": base64.b64encode(data).decode()}

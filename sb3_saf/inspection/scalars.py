@@ -138,23 +138,20 @@ def policy_distances(action_space: spaces.Space[Any], actions: Floats) -> Double
 
 def _overlap(action_space: spaces.Space[Any], p: Floats, q: Floats) -> Doubles:
     """Return Bhattacharyya coefficients (n,), a product over action dimensions."""
+    from scipy.special import expit, softmax  # imported here, since it takes a tenth of a second
+
     if isinstance(action_space, spaces.Box):
         (mean_p, log_p), (mean_q, log_q) = np.split(p, 2, axis=1), np.split(q, 2, axis=1)
         total = np.exp(2 * log_p) + np.exp(2 * log_q)
         scale = np.sqrt(2 * np.exp(log_p + log_q) / total)
         return (scale * np.exp(-((mean_p - mean_q) ** 2) / (4 * total))).prod(axis=1)
     if isinstance(action_space, spaces.MultiBinary):
-        on_p, on_q = 1 / (1 + np.exp(-p)), 1 / (1 + np.exp(-q))
+        on_p, on_q = expit(p), expit(q)
         return (np.sqrt(on_p * on_q) + np.sqrt((1 - on_p) * (1 - on_q))).prod(axis=1)
-
-    def softmax(logits: Floats) -> Doubles:
-        powers = np.exp(logits - logits.max(axis=1, keepdims=True))
-        return np.asarray(powers / powers.sum(axis=1, keepdims=True))
-
     nvec = action_space.nvec.reshape(-1) if isinstance(action_space, spaces.MultiDiscrete) else [p.shape[1]]
     edges = np.cumsum(nvec)[:-1]
     pairs = zip(np.split(p, edges, axis=1), np.split(q, edges, axis=1), strict=True)
-    return np.prod([np.sqrt(softmax(one) * softmax(other)).sum(axis=1) for one, other in pairs], axis=0)
+    return np.prod([np.sqrt(softmax(one, axis=1) * softmax(other, axis=1)).sum(axis=1) for one, other in pairs], axis=0)
 
 
 # --- the knowledge source ---------------------------------------------------------------------------------------------
