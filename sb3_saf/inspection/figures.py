@@ -158,12 +158,7 @@ def attention_over_time(write: npt.NDArray[np.float32]) -> Figure:
 
 
 def calibration(values: npt.NDArray[Any], returns: npt.NDArray[Any], summary: Calibration) -> Figure:
-    """
-    Draw values against returns, and mean returns of tenths by value.
-
-    :param values: (n,)
-    :param returns: (n,)
-    """
+    """Draw values (n,) against returns (n,), and mean returns of tenths by value."""
     figure, (axes,) = _figure(5.4, 4.8, title="Critic calibration")
     few = np.linspace(0, len(values) - 1, min(len(values), _SCATTERED)).astype(int)
     axes.scatter(values[few], returns[few], s=6, alpha=0.25, color=_GREY, linewidths=0, label="single steps")

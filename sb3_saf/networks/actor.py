@@ -57,12 +57,7 @@ class ActionHead(nn.Module):
         self.net = mlp(sizes, spec.activation_fn, output_gain=ACTION_GAIN)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        """
-        Return the parameters of the action distribution.
-
-        :param features: (K, d)
-        :return: (K, P)
-        """
+        """Return the parameters (K, P) of the action distributions for features (K, d)."""
         outputs: th.Tensor = self.net(features)
         return outputs if self.log_std is None else th.cat([outputs, self.log_std.expand_as(outputs)], dim=1)
 

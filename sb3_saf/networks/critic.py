@@ -67,12 +67,7 @@ class TeamCritic(nn.Module, ABC):
         """
 
     def values(self, states: th.Tensor) -> th.Tensor:
-        """
-        Return the value of every agent of every team.
-
-        :param states: (G, U, S) states, or (G, U, H) of their memory
-        :return: (G, N)
-        """
+        """Return the values (G, N) of all agents from states (G, U, S), or from those of their memory (G, U, H)."""
         return self.value_head.of_teams(states)
 
 
@@ -89,23 +84,12 @@ class OwnValueHead(nn.Module):
         self.head: nn.Module = AgentHeads(make_head, spec.n_agents) if self.reads_agent else make_head()
 
     def forward(self, features: th.Tensor, agent: th.Tensor | None = None) -> th.Tensor:
-        """
-        Return values of single agents.
-
-        :param features: (K, d)
-        :param agent: (K,) int64 index of the agent, where ``reads_agent``
-        :return: (K,)
-        """
+        """Return values (K,) of single agents from features (K, d), and where ``reads_agent`` their indices (K,)."""
         values: th.Tensor = self.head(features, agent) if self.reads_agent else self.head(features)
         return values.squeeze(1)
 
     def of_teams(self, features: th.Tensor) -> th.Tensor:
-        """
-        Return values of whole teams.
-
-        :param features: (G, N, d)
-        :return: (G, N)
-        """
+        """Return values (G, N) of whole teams from features (G, N, d)."""
         n_teams, n_agents, _ = features.shape
         agent = th.arange(n_agents, device=features.device).repeat(n_teams) if self.reads_agent else None
         values: th.Tensor = self(features.flatten(0, 1), agent)
@@ -132,12 +116,7 @@ class JointValueHead(nn.Module):
         self.heads = nn.ModuleList(mlp([n_inputs, *spec.value_hidden, 1], spec.activation_fn) for _ in range(n_heads))
 
     def of_teams(self, features: th.Tensor) -> th.Tensor:
-        """
-        Return values of whole teams.
-
-        :param features: (G, N, d), or joint features of any other form (G, ...)
-        :return: (G, N)
-        """
+        """Return values (G, N) of whole teams from features (G, N, d), or joint ones of any other form (G, ...)."""
         joint = features.flatten(1)
         if self.agent_identity:  # the joint part of the first layer is computed once per team
             first, *rest = cast(nn.Sequential, self.heads[0])
@@ -178,12 +157,7 @@ class StateCritic(nn.Module):
         self.value_head = JointValueHead(spec, spec.features_dim, heads, agent_identity)
 
     def forward(self, states: th.Tensor) -> th.Tensor:
-        """
-        Return the value of every agent of every game.
-
-        :param states: (G, *state) states, as SB3 preprocesses observations
-        :return: (G, N)
-        """
+        """Return the values (G, N) of all agents from states (G, *state), as SB3 preprocesses observations."""
         return self.value_head.of_teams(self.encoder(states))
 
 

@@ -219,12 +219,7 @@ class SelfAttentionBlock(nn.Module):
         self.mlp = mlp([features_dim] * 3, nn.GELU)
 
     def forward(self, slots: th.Tensor) -> th.Tensor:
-        """
-        Update the slots.
-
-        :param slots: (G, L, d)
-        :return: (G, L, d)
-        """
+        """Update the slots (G, L, d)."""
         normed = self.norm(slots)
         slots = slots + self.attention(normed, normed)[0]
         return slots + self.mlp(self.mlp_norm(slots))

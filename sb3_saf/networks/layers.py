@@ -182,13 +182,7 @@ class AgentHeads(nn.Module):
         self.heads = nn.ModuleList(make_head() for _ in range(n_agents))
 
     def forward(self, x: th.Tensor, agent: th.Tensor) -> th.Tensor:
-        """
-        Apply the head of its agent to each row.
-
-        :param x: (K, d)
-        :param agent: (K,) int64 in 0..N-1
-        :return: (K, P)
-        """
+        """Apply the head of its agent (K,), int64 in 0..N-1, to each row of (K, d); (K, P)."""
         if th.compiler.is_compiling():  # graphs have no data-dependent sizes
             every = th.stack([head(x) for head in self.heads], dim=1)
             return every.gather(1, agent.reshape(-1, 1, 1).expand(-1, 1, every.shape[2])).squeeze(1)

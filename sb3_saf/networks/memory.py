@@ -88,14 +88,7 @@ class Memory(nn.Module):
     def step(
         self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Run over one step.
-
-        :param inputs: (R, d)
-        :param memory: (R, M) memory before the step
-        :param starts: (R,) bool, where an episode begins
-        :return: outputs (R, H), and the memory (R, M) after the step
-        """
+        """Run over one step: :meth:`forward` without the axis T."""
         outputs, memory = self(inputs.unsqueeze(0), memory, None if starts is None else starts.unsqueeze(0))
         return outputs.squeeze(0), memory
 

@@ -73,20 +73,11 @@ class EncodedRows(NamedTuple):
         return gather(self.features, self.inverse)
 
     def at(self, rows: th.Tensor) -> EncodedRows:
-        """
-        Select rows.
-
-        :param rows: (B',) int64
-        """
+        """Select rows (B',), int64."""
         return self._replace(inverse=rows if isinstance(self.inverse, InOrder) else self.inverse[rows])
 
     def arranged(self, shape: tuple[int, ...]) -> Rows:
-        """
-        Arrange the rows in a shape.
-
-        :param shape: shape with B entries
-        :return: index into ``features`` of each row, in that shape
-        """
+        """Return the index into ``features`` of each row, arranged in a shape with B entries."""
         return InOrder(shape) if isinstance(self.inverse, InOrder) else self.inverse.view(shape)
 
 
@@ -106,12 +97,7 @@ class EncodedTeams(NamedTuple):
     active: th.Tensor | None = None
 
     def of_rows(self, of_agents: th.Tensor) -> th.Tensor:
-        """
-        Select the entries of rows from those of all agents.
-
-        :param of_agents: (G, N, ...)
-        :return: (B, ...)
-        """
+        """Select the entries (B, ...) of rows from those of all agents (G, N, ...)."""
         flat = of_agents.flatten(0, 1)
         return flat if self.rows is None else gather(flat, self.rows)
 
@@ -184,22 +170,14 @@ class RowEncoder:
         self.once = once
 
     def find(self, x: th.Tensor) -> UniqueRows:
-        """
-        Find the unique rows of a batch, or all where each is encoded.
-
-        :param x: (B, ...)
-        """
+        """Find the unique rows of a batch (B, ...), or all where each is encoded."""
         if self.once and x.device.type == "cpu":
             return unique_rows(x)
         rows = th.arange(len(x), device=x.device)
         return UniqueRows(rows, rows)
 
     def rows(self, observations: th.Tensor) -> EncodedRows:
-        """
-        Encode own observations. The result depends on them only, to the last bit.
-
-        :param observations: (B, *shape)
-        """
+        """Encode own observations (B, *shape). The result depends on them only, to the last bit."""
         if not self.once or observations.device.type != "cpu":
             return EncodedRows(observations, self.encode(observations), InOrder((len(observations),)))
         found = self.find(observations)

@@ -64,12 +64,7 @@ class Mixer(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, state: th.Tensor, choice: JointChoice) -> Mixed:
-        """
-        Compute the value of joint actions.
-
-        :param state: (G, S)
-        :param choice: joint actions of G steps
-        """
+        """Compute the value of joint actions in states (G, S)."""
 
 
 class VDNMixer(Mixer):
@@ -86,7 +81,6 @@ class QMIXMixer(Mixer):
 
     h = ELU(sum_i |W1_i(s)| Q_i + b1(s)), Q_tot = |w2(s)| . h + b2(s). Q_tot is thus monotonic in every Q_i.
 
-    :param state_dim: S
     :param hidden: size of the hidden layer of b2's network
     :param embedding_dim: size of h
     """
@@ -141,9 +135,6 @@ class AttentionKernels(nn.Module):
     """
     lambda_i(s, a) = sum over K kernels of |key_k(s)| sigmoid(agents_ki(s)) sigmoid(action_ki(s, a)).
 
-    :param state_dim: S
-    :param n_actions: A
-    :param n_kernels: K
     :param hidden: sizes of the hidden layers of the networks of each kernel
     """
 
@@ -180,8 +171,6 @@ class QPLEXMixer(Mixer):
     computed as published: Q_tot = sum_i Q'_i + sum_i stopgrad(A'_i) (lambda_i - 1). The value is the same; advantages
     train the weights lambda only, not the agents.
 
-    :param state_dim: S
-    :param n_actions: A
     :param hidden: size of the hidden layer of the networks of w and b
     :param n_kernels: K, attention kernels that are summed to lambda
     :param kernel_hidden: sizes of the hidden layers of each kernel's networks

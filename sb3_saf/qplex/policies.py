@@ -59,27 +59,14 @@ def q_values(
 
 
 class AgentMemory(Memory):
-    """
-    Memory of an agent, which reads the features, the last action and the agent's index.
-
-    :param kind: ``"gru"`` or ``"lstm"``
-    :param n_actions: A
-    :param size: H
-    """
+    """Memory of an agent, which reads the features, the last action and the agent's index."""
 
     def __init__(self, kind: MemoryName, features_dim: int, n_actions: int, n_agents: int, size: int):
         super().__init__(kind, features_dim + n_actions + n_agents, size)
         self.n_actions, self.n_agents, self.size = n_actions, n_agents, size
 
     def inputs(self, features: th.Tensor, last_actions: th.Tensor, agent: th.Tensor) -> th.Tensor:
-        """
-        Concatenate the inputs.
-
-        :param features: (K, d)
-        :param last_actions: (K,) int64, -1 at the start of an episode
-        :param agent: (K,) int64
-        :return: (K, d + A + N)
-        """
+        """Concatenate features (K, d), last actions (K,), -1 where episodes begin, and agents (K,); (K, d + A + N)."""
         # One extra class for "none", which is then cut off.
         last = nn.functional.one_hot(last_actions + 1, self.n_actions + 1)[:, 1:]
         identity = nn.functional.one_hot(agent, self.n_agents)
