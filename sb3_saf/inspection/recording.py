@@ -432,7 +432,9 @@ class _Recorder:
 
     def _collect(self, step: PlayedStep) -> None:
         n_agents, of_team, columns = self.n_agents, self.reader.of_team, self.columns
-        counted = np.repeat(step.counted, n_agents) & _active(step.observations, n_agents)
+        counted = np.repeat(step.counted, n_agents)
+        if ACTIVE_KEY in step.observations:
+            counted &= np.asarray(step.observations[ACTIVE_KEY][::n_agents]).reshape(-1) != 0
         layer = unwrap_vec_normalize(self.env)
         raw = np.array(step.rewards) if layer is None else layer.get_original_reward()
         rewards = raw if self.normalizer is None else self.normalizer.normalize_reward(raw)
@@ -468,13 +470,6 @@ class _Recorder:
             values_without={name: np.stack(values) for name, values in self.without.items()},
             **columns,
         )
-
-
-def _active(obs: Any, n_agents: int) -> Bools:
-    """Return whether the row's agent takes part, (B,)."""
-    if ACTIVE_KEY not in obs:
-        return np.ones(len(obs[OBS_KEY]), dtype=bool)
-    return np.asarray(obs[ACTIVE_KEY][::n_agents]).reshape(-1) != 0
 
 
 def _last_values(reader: PolicyReader | QReader, ends: Bools, infos: list[dict[str, Any]], n_agents: int) -> Floats:

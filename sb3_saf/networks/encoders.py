@@ -220,10 +220,6 @@ class PixelInput(nn.Module):
             pictures = pictures.permute(0, 3, 1, 2)
         return pictures.contiguous(memory_format=th.channels_last)
 
-    def tiles(self, codes: th.Tensor) -> th.Tensor:
-        """Return pictures (U, C, t, t) of single tiles with codes (U,)."""
-        return self.atlas[codes].permute(0, 3, 1, 2)
-
     def looks_up(self, observations: th.Tensor) -> bool:
         """Return whether a first layer looks tiles up: of codes on the CPU. On other devices products are cheaper."""
         return self.layout == "codes" and observations.device.type == "cpu" and not th.compiler.is_compiling()
@@ -288,7 +284,8 @@ class PaperCNN(Encoder):
         first = self.net[0]
         assert isinstance(first, nn.Conv2d) and first.bias is not None
         codes, views = used_codes(observations.flatten(1))
-        table = table_of_convolution(self.pixels.tiles(codes), first.weight, stride=2)
+        tiles = self.pixels.atlas[codes].permute(0, 3, 1, 2)
+        table = table_of_convolution(tiles, first.weight, stride=2)
         return self.net[2:](rectified_sums(views, table, first.bias, self._places))
 
 

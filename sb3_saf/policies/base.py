@@ -316,7 +316,7 @@ class TeamPolicy(RememberingPolicy):
         :param obs: rows
         :return: (B, 1)
         """
-        critic = None if self.memory is None else self._remembering_critic
+        critic = self._remembering_critic
         if critic is not None and not isinstance(obs, TeamMinibatch):
             return self._values_of_running_games(obs, critic)
         return self._values(obs, self._encoded(obs))
