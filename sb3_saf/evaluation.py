@@ -16,13 +16,24 @@ from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, unwrap_vec_wrapper
 
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.envs.monitor import TeamMonitor
 from sb3_saf.policies.rows import TeamRowsPolicy
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.rows import ACTION_MASK_KEY, AGENT_KEY, IS_SUCCESS, OBS_KEY, STAGGERED, Array, NormalizedSpace
+from sb3_saf.teams.rows import (
+    ACTION_MASK_KEY,
+    AGENT_KEY,
+    FIXED_SHAPE,
+    IS_SUCCESS,
+    OBS_KEY,
+    STAGGERED,
+    Array,
+    NormalizedSpace,
+    bounds_of,
+    choices_of,
+)
 from sb3_saf.teams.vec_env import episode_value, layers, require_n_agents, share_of_sum, team_dones
 
 Observation = npt.NDArray[Any] | dict[str, npt.NDArray[Any]]
@@ -154,7 +165,7 @@ class RandomPolicy:
                 )
         if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
             raise ValueError(f"a uniform policy needs a bounded action space, got {action_space}; rescale the actions")
-        if not isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Box)):
+        if not isinstance(action_space, FIXED_SHAPE):
             raise ValueError(
                 f"the action space must be Discrete, MultiDiscrete, MultiBinary or Box, got {action_space}"
             )
@@ -180,11 +191,8 @@ class RandomPolicy:
         Draw an action for each row; see SB3's ``predict``.
 
         :param observation: observations of B rows, of which only number and masks are used
-        :param state: returned unchanged
-        :param episode_start: unused
-        :param deterministic: unused, a random policy has no most likely action
         :param action_masks: (B, M) as for MaskablePPO: one flag per choice, those of each action dimension in turn
-        :return: actions (B, ...), and ``state``
+        :return: actions (B, ...), and ``state`` unchanged; the other arguments have no effect
         """
         masks = action_masks
         if isinstance(observation, dict) and ACTION_MASK_KEY in observation:
@@ -202,24 +210,16 @@ class RandomPolicy:
         space = self.action_space
         assert not isinstance(space, spaces.Box), "Box actions have no masks"
         keys = np.where(masks, self._rng.random(masks.shape), -1.0)
-        if isinstance(space, spaces.Discrete):
-            return keys.argmax(axis=1) + space.start
-        sizes = space.nvec.reshape(-1) if isinstance(space, spaces.MultiDiscrete) else np.full(space.shape, 2)
-        choices = [part.argmax(axis=1) for part in np.split(keys, np.cumsum(sizes.reshape(-1))[:-1], axis=1)]
-        actions = np.stack(choices, axis=1).reshape(len(masks), *space.shape)
+        parts = np.split(keys, np.cumsum(choices_of(space))[:-1], axis=1)
+        actions = np.stack([part.argmax(axis=1) for part in parts], axis=1).reshape(len(masks), *(space.shape or ()))
         return (actions + getattr(space, "start", 0)).astype(space.dtype)
 
     def _draw(self, n_rows: int) -> Array:
-        space, rng = self.action_space, self._rng
-        shape = (n_rows, *(space.shape or ()))
-        if isinstance(space, spaces.Discrete):
-            return rng.integers(space.start, space.start + space.n, size=shape)
-        if isinstance(space, spaces.MultiDiscrete):
-            return rng.integers(space.start, space.start + space.nvec, size=shape)
-        if isinstance(space, spaces.MultiBinary):
-            return rng.integers(0, 2, size=shape).astype(space.dtype)
-        assert isinstance(space, spaces.Box)
-        return self._draw_box(*(np.broadcast_to(bound, shape) for bound in (space.low, space.high)))
+        space, (low, high) = self.action_space, bounds_of(self.action_space)
+        shape = (n_rows, *low.shape)
+        if isinstance(space, spaces.Box):
+            return self._draw_box(np.broadcast_to(low, shape), np.broadcast_to(high, shape))
+        return self._rng.integers(low, high, endpoint=True, size=shape).astype(space.dtype)
 
     def _draw_box(self, low: Array, high: Array) -> Array:
         """Draw actions between bounds (B, ...)."""
@@ -278,9 +278,8 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
             remaining = np.maximum(remaining - whole, 0)
             observations, starts = following, dones
     finally:  # whoever trains on these games holds observations of episodes that are gone
-        for layer in layers(env):
-            if isinstance(layer, CentralizedValueWrapper):
-                layer.was_evaluated = True
+        if (joint := unwrap_vec_wrapper(env, CentralizedValueWrapper)) is not None:
+            joint.was_evaluated = True
 
 
 def actions_of(model: PolicyPredictor, env: VecEnv, deterministic: bool = False) -> Act:

@@ -283,13 +283,8 @@ def n_mask_entries(action_space: spaces.Space[Any]) -> int | None:
     :param action_space: Discrete(A); MultiDiscrete, whose masks follow one another; MultiBinary(n), A = 2 n, whether 0
         and whether 1 is legal for each entry in turn
     """
-    if isinstance(action_space, spaces.Discrete):
-        return int(action_space.n)
-    if isinstance(action_space, spaces.MultiDiscrete) and len(action_space.shape) == 1:
-        return int(action_space.nvec.sum())
-    if isinstance(action_space, spaces.MultiBinary) and len(action_space.shape) == 1:
-        return 2 * action_space.shape[0]
-    return None
+    has_choices = isinstance(action_space, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
+    return sum(choices_of(action_space)) if has_choices and len(action_space.shape or ()) <= 1 else None
 
 
 def choices_of(action_space: spaces.Space[Any]) -> tuple[int, ...]:
