@@ -12,7 +12,6 @@ import hmac
 import math
 import os
 import pickle
-import random
 import secrets
 import sys
 import time
@@ -35,7 +34,7 @@ from gymnasium.utils import EzPickle
 from sb3_saf.envs.audit import layers_of, legal_sample, settings_of
 from sb3_saf.teams.checks import CheckpointError
 from sb3_saf.teams.files import decode, encode
-from sb3_saf.teams.randomness import own_randomness
+from sb3_saf.teams.randomness import generator_states, own_randomness, set_generator_states
 from sb3_saf.teams.rows import ACTION_MASK_KEY
 
 if TYPE_CHECKING:
@@ -119,13 +118,13 @@ def pickled(game: Any) -> npt.NDArray[np.uint8]:
 
     :func:`find_way` tests that the copy behaves equally.
     """
-    return np.frombuffer(packed((game, _global_generators()), game), dtype=np.uint8)
+    return np.frombuffer(packed((game, generator_states()), game), dtype=np.uint8)
 
 
 def unpickled(data: npt.NDArray[np.uint8], game: Any) -> Any:
     """Unpickle a game and restore the global random generators; only for signed data."""
-    found, generators = unpacked(data.tobytes(), game)
-    _set_global_generators(generators)
+    found, states = unpacked(data.tobytes(), game)
+    set_generator_states(states)
     return found
 
 
@@ -164,15 +163,6 @@ def _unpicklable(game: Any) -> dict[int, _Place]:
             except Exception:
                 found[id(value)] = (number, name)
     return found
-
-
-def _global_generators() -> tuple[Any, Any]:
-    return random.getstate(), np.random.get_state()  # noqa: NPY002 - games draw from it
-
-
-def _set_global_generators(states: tuple[Any, Any]) -> None:
-    random.setstate(states[0])
-    np.random.set_state(states[1])  # noqa: NPY002
 
 
 # --- signatures -------------------------------------------------------------------------------------------------------
@@ -298,13 +288,13 @@ def _difference(
     """Return the first difference between a game and its copy, or None."""
     rows, _ = _play(original, original.reset(seed=0)[0], TRIAL_STEPS)
     copy.restore(decode(encode(original.snapshot(way))))
-    began = _global_generators()
+    began = generator_states()
     _play(third, third.reset(seed=1)[0], TRIAL_STEPS)
-    _set_global_generators(began)
+    set_generator_states(began)
     _, seen = _play(original, rows, TRIAL_STEPS)
     seen.append(_bytes_of(original.reset()[0]))
     if way == "pickle":  # includes the global generators
-        _set_global_generators(began)
+        set_generator_states(began)
     _, seen_by_copy = _play(copy, rows, len(seen) - 1, math.inf)
     seen_by_copy.append(_bytes_of(copy.reset()[0]))
     for step, (one, other) in enumerate(zip(seen, seen_by_copy, strict=True), 1):

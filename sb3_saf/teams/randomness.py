@@ -7,7 +7,7 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch as th
@@ -38,6 +38,17 @@ def game_seeds(seed: int | None, n_games: int) -> list[int]:
     return [(start + index * _STRIDE) % 2**_SEED_BITS for index in range(n_games)]
 
 
+def generator_states() -> tuple[Any, Any]:
+    """Return the states of Python's and NumPy's global generators, from which SB3 and games draw."""
+    return random.getstate(), np.random.get_state()  # noqa: NPY002
+
+
+def set_generator_states(states: tuple[Any, Any]) -> None:
+    """Restore what :func:`generator_states` returned."""
+    random.setstate(states[0])
+    np.random.set_state(states[1])  # noqa: NPY002
+
+
 @contextmanager
 def own_randomness(seed: int, device: th.device) -> Iterator[None]:
     """
@@ -46,7 +57,7 @@ def own_randomness(seed: int, device: th.device) -> Iterator[None]:
     :param seed: seed of Python's, NumPy's and torch's generators
     :param device: the model's device; on a GPU its generator is included
     """
-    of_python, of_numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 - SB3 draws from it
+    states = generator_states()
     try:
         with th.random.fork_rng(devices=[device] if device.type == "cuda" else []):
             random.seed(seed)
@@ -54,5 +65,4 @@ def own_randomness(seed: int, device: th.device) -> Iterator[None]:
             th.manual_seed(seed)
             yield
     finally:
-        random.setstate(of_python)
-        np.random.set_state(of_numpy)  # noqa: NPY002
+        set_generator_states(states)
