@@ -165,9 +165,9 @@ class Trial:
                 for name, flags in (("terminations", terminations), ("truncations", truncations)):
                     ended |= {agent for agent in listed if end_of(name, flags, agent, self._place)}
                 playing = self._playing(ended)
-                respawned = respawned_agents(self.env, ended, terminations, truncations)
+                respawned = respawn_note(self.env, ended, terminations, truncations, self._place)
                 if respawned and not any(note.endswith(RESPAWNED) for note in self.notes):
-                    self._note(f"{respawned[0]} has ended and is in agents again {self._place}, {RESPAWNED}")
+                    self._note(respawned)
 
     def check_seed(self) -> None:
         """Note that first observations differ in two resets with one seed."""
@@ -277,12 +277,14 @@ RESPAWNED: Final = (
 )
 
 
-def respawned_agents(
-    env: Any, ended: Collection[Any], terminations: Mapping[Any, Any], truncations: Mapping[Any, Any]
-) -> list[Any]:
-    """Return the agents that have ended before this step and play in it."""
-    playing = [agent for agent in env.agents if not terminations.get(agent, True) and not truncations.get(agent)]
-    return [agent for agent in playing if agent in ended]
+def respawn_note(
+    env: Any, ended: Collection[Any], terminations: Mapping[Any, Any], truncations: Mapping[Any, Any], place: str
+) -> str | None:
+    """Return a note if an agent has ended before this step and plays in it."""
+    for agent in env.agents:
+        if agent in ended and not terminations.get(agent, True) and not truncations.get(agent):
+            return f"{agent} has ended and is in agents again {place}, {RESPAWNED}"
+    return None
 
 
 class FormError(ValueError):
@@ -507,9 +509,9 @@ def observation_of(observations: Mapping[Any, Any], agent: Any, place: str) -> A
 def reward_of(rewards: Mapping[Any, Any], agent: Any, place: str, required: bool) -> float:
     """Return the reward of an agent; agents that did not act need none."""
     reward = rewards.get(agent)
-    if reward is None and agent not in rewards:
-        if not required:
-            return 0.0
+    if reward is None and not required:
+        return 0.0
+    if agent not in rewards:
         raise ValueError(
             f"expected a reward for {agent}, which acted, {place}, got rewards for {list(rewards)}; give every agent "
             "that acts a reward, 0.0 for none"
@@ -518,8 +520,6 @@ def reward_of(rewards: Mapping[Any, Any], agent: Any, place: str, required: bool
         return reward
     number = _single(reward)
     if number is None:
-        if reward is None and not required:
-            return 0.0
         raise ValueError(f"expected a number as the reward of {agent} {place}, got {reward!r}")
     return float(number)
 

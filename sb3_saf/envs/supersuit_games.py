@@ -20,9 +20,9 @@ from typing import Any, Final, TypeAlias
 import cloudpickle
 import numpy as np
 import numpy.typing as npt
-import torch as th
 from gymnasium.utils import EzPickle
 from gymnasium.vector.utils import iterate
+from stable_baselines3.common.utils import set_random_seed
 from supersuit.vector import ConcatVecEnv, MarkovVectorEnv
 
 from sb3_saf.envs import audit
@@ -60,6 +60,7 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
     """
 
     par_env: AnyParallelEnv
+    closed: bool
 
     def __init__(self, env: AnyParallelEnv, reader: GameReader, index: int, notes: list[str]) -> None:
         check_is_parallel(env, is_factory=True)
@@ -76,7 +77,6 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         self._index = index
         self._reader = reader
         self._notes = notes
-        self._is_closed = False
         self._count_step(0)
         self._ended: set[Any] = set()
         #: Agents that take part, in the order of the rows: a set with an order.
@@ -116,7 +116,9 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         terminated = {agent for agent in acted if audit.end_of("terminations", terminations, agent, self._place)}
         truncated = {agent for agent in acted if audit.end_of("truncations", truncations, agent, self._place)}
         truncated -= terminated
-        self._note_respawned(terminations, truncations)
+        respawned = audit.respawn_note(self.par_env, self._ended, terminations, truncations, self._place)
+        if respawned and not self._notes:
+            self._notes.append(respawned)
         self._ended |= terminated | truncated
         self._playing = self._find_playing()
         flags = ("terminations", terminations), ("truncations", truncations)
@@ -153,20 +155,14 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
 
     def close(self) -> None:
         """Close the game, once."""
-        if not self._is_closed:
-            self._is_closed = True
+        if not self.closed:
+            self.closed = True
             super().close()
 
     def _find_playing(self) -> dict[Any, None]:
         """Return the agents that take part; an agent that has ended does not return."""
         present = audit.present_agents(self.par_env, self.agents, self._place)
         return {agent: None for agent in self.agents if agent in present and agent not in self._ended}
-
-    def _note_respawned(self, terminations: Mapping[Any, Any], truncations: Mapping[Any, Any]) -> None:
-        """Warn of agents that have ended and play again."""
-        respawned = audit.respawned_agents(self.par_env, self._ended, terminations, truncations)
-        if respawned and not self._notes:
-            self._notes.append(f"{respawned[0]} has ended and is in agents again {self._place}, {audit.RESPAWNED}")
 
     def _infos(
         self, infos: Mapping[Any, Any], acted: Container[Any], reserved: frozenset[str] = RESERVED_KEYS
@@ -315,12 +311,6 @@ def _copying(env: Any) -> Iterator[None]:
         ) from error
 
 
-def _seed_generators(seed: int) -> None:
-    random.seed(seed)
-    np.random.seed(seed % 2**32)  # noqa: NPY002
-    th.manual_seed(seed)
-
-
 class TeamConcatVecEnv(ConcatVecEnv):
     """
     Games of one process, one after another.
@@ -341,7 +331,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
         self._indices = indices
         self._is_worker = is_worker
         if is_worker:
-            _seed_generators(random.getrandbits(32) + indices[0])
+            set_random_seed((random.getrandbits(32) + indices[0]) % 2**32)
         self.vec_envs: list[TeamMarkovVectorEnv] = []  # until Gymnasium 1.2, close also runs if construction failed
         super().__init__(
             [lambda index=index: TeamMarkovVectorEnv(make_game(), reader, index, self._notes) for index in indices]
@@ -363,7 +353,7 @@ class TeamConcatVecEnv(ConcatVecEnv):
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:
         """Begin an episode in every game of this process; seeds and options are those of all E games."""
         if self._is_worker and (seed := seeds[self._indices[0]]) is not None:
-            _seed_generators(seed)
+            set_random_seed(seed)
         games = zip(self._indices, self.vec_envs, strict=True)
         started = [game.reset(seed=seeds[index], options=options[index]) for index, game in games]
         observations, infos = zip(*started, strict=True)
