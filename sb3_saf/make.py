@@ -100,14 +100,10 @@ def make_team_env(
     :param params: parameters of the task or the factory, such as ``n_agents=5``
     :raises ValueError: if the arguments do not fit together, with a fix
     """
-    check_count("n_envs", n_envs)
-    check_count("n_cpus", n_cpus)
     if monitor_dir is not None and os.path.exists(monitor_dir) and not os.path.isdir(monitor_dir):
         raise ValueError(f"monitor_dir must be a folder, which is created if missing; {monitor_dir} is a file")
     check_choice("active", active, (None, True, False))
     check_choice("action_masks", action_masks, ("auto", True, False))
-    if backend is not None:
-        check_choice("backend", backend, get_args(Backend))
     if team_reward is not None:
         check_choice("team_reward", team_reward, get_args(TeamReward))
     source = find_environment(env) if isinstance(env, str) else env
@@ -158,9 +154,7 @@ def make_vec_env(
     :return: a VecEnv of B = E N rows with attributes ``n_games`` and ``n_agents``
     :raises ValueError: for an unknown name, backend or parameter, or a value out of range
     """
-    if backend is not None:
-        check_choice("backend", backend, get_args(Backend))
-    request = Request(check_count("n_envs", n_envs), backend, check_count("n_cpus", n_cpus), stagger=stagger)
+    request = Request(n_envs, backend, n_cpus, stagger=stagger)
     return _make_rows(find_environment(env), request, seed, params)
 
 
@@ -191,6 +185,10 @@ def _make_rows(
     source: TeamEnvironment | AnyParallelEnv | EnvFactory, request: Request, seed: int | None, params: dict[str, Any]
 ) -> VecEnv:
     """Make the rows of the games in the suite's own engine or through SuperSuit."""
+    check_count("n_envs", request.n_envs)
+    check_count("n_cpus", request.n_cpus)
+    if request.backend is not None:
+        check_choice("backend", request.backend, get_args(Backend))
     env = source if isinstance(source, TeamEnvironment) else None
     name = env.id if env is not None else getattr(source, "__qualname__", None) or type(source).__name__
     suite = None if env is None else env.suite
