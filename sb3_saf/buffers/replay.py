@@ -168,9 +168,7 @@ class TeamReplayBuffer(ReplayBuffer):
     @property
     def nbytes(self) -> int:
         """Size of all arrays in bytes."""
-        parts = [*self.seen.values(), *self.aside.values()]
-        parts += [self.actions, self.rewards, self.terminal, self.ended, self.starts, self.aside_index]
-        return sum(array.nbytes for array in parts)
+        return sum(array.nbytes for array in [*self._by_slot().values(), *self.aside.values()])
 
     @property
     def n_stored(self) -> int:
@@ -380,7 +378,6 @@ class TeamReplayBuffer(ReplayBuffer):
         Return the given team steps.
 
         :param batch_inds: (G,) each is ``step * E + game``, steps counted from the oldest
-        :param env: must be None
         """
         if env is not None:
             raise ValueError("TeamReplayBuffer does not undo VecNormalize; scale observations in the game")

@@ -95,13 +95,7 @@ class LaterValues(th.Tensor):
 
     @classmethod
     def of(cls, step: Step, like: th.Tensor, compute: Compute) -> LaterValues:
-        """
-        Make values to be computed later.
-
-        :param step: input of the critic
-        :param like: (B, ...) tensor with their device and number of rows
-        :param compute: the critic
-        """
+        """Make values to be computed later; ``like`` (B, ...) has their device and number of rows."""
         later = like.new_empty(len(like), 1).as_subclass(cls)
         later.step, later.compute, later.known = step, compute, None
         return later
@@ -115,11 +109,7 @@ class LaterValues(th.Tensor):
 
 
 def compute_together(steps: Sequence[LaterValues]) -> list[th.Tensor]:
-    """
-    Compute the values of several steps of one policy.
-
-    :return: values (B, 1) of each step
-    """
+    """Compute the values, (B, 1), of several steps of one policy."""
     waiting = [step for step in steps if step.known is None]
     if waiting:
         for step, values in zip(waiting, waiting[0].compute([step.step for step in waiting]), strict=True):
@@ -376,7 +366,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 state = self.team_spaces.state
                 self.states = np.zeros((*shape, *(state.shape or ())), dtype=state.dtype)
             self._allocated = True
-        self.generator_ready = False
         self._later.clear()
         self.memories = None
         BaseBuffer.reset(self)
@@ -531,9 +520,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         """
         if not self.full:
             raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
-        teams_per_batch = self.buffer_size * self.n_games
-        if batch_size is not None:
-            teams_per_batch = max(1, batch_size // self.n_agents)
         # Team steps with at least one active agent, each ``step * E + game``.
         playing = np.arange(self.buffer_size * self.n_games)
         if self.active is not None:
@@ -550,7 +536,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             sequences = firsts[:, np.newaxis] + np.arange(0, stride, self.n_games)
         # SB3 seeds only NumPy's global generator from the run's seed.
         order = sequences[np.random.permutation(len(sequences))]  # noqa: NPY002
-        per_batch = max(1, teams_per_batch // sequences.shape[1])
+        per_batch = len(order)
+        if batch_size is not None:
+            per_batch = max(1, batch_size // self.n_agents // sequences.shape[1])
         for start in range(0, len(order), per_batch):
             yield self._get_samples(order[start : start + per_batch].T)
 
@@ -561,7 +549,6 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         Return the active rows of the given team steps.
 
         :param batch_inds: (L, S) team steps of S sequences, each ``step * E + game``
-        :param env: unused, as in SB3's buffers for rollouts
         :return: L * S * N rows without those of inactive agents
         """
         first, batch_inds, sequences = batch_inds[0], batch_inds.reshape(-1), None
