@@ -38,8 +38,7 @@ def game_steps(model: BaseAlgorithm) -> int | None:
     """
     Return the game steps that a model was trained for: its ``num_timesteps`` (agent steps) divided by N.
 
-    :param model: an algorithm with or without an environment
-    :return: None if its environment has no teams
+    :return: None if it has no environment, or one without teams
     """
     venv = model.get_env()
     n_agents = None if venv is None else find_n_agents(venv)
@@ -95,9 +94,9 @@ class GameStepsBoard(TensorBoardOutputFormat):
 
 def show_game_steps(model: BaseAlgorithm) -> None:
     """
-    Make TensorBoard count game steps from now on; callbacks of this package do so when training starts.
+    Make TensorBoard count game steps from now on, of a model in ``learn``; without teams nothing changes.
 
-    :param model: a model in ``learn``; nothing changes if its environment has no teams
+    Callbacks of this package do so when training starts.
     """
     venv = model.get_env()
     n_agents = None if venv is None else find_n_agents(venv)

@@ -276,12 +276,7 @@ class TeamReplayBuffer(ReplayBuffer):
         }
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Restore a state.
-
-        :param state: result of :meth:`checkpoint_state`
-        :raises ValueError: for the state of another buffer, naming the first difference
-        """
+        """Restore a state of :meth:`checkpoint_state`; the ValueError for that of another buffer names what differs."""
         if state["n_slots"] != self.n_slots:
             raise ValueError(f"expected a replay buffer of {self.n_slots} slots, got {state['n_slots']}")
         n_filled = self.n_slots if state["n_steps"] == self.buffer_size else state["pos"] + 1

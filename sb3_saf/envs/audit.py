@@ -362,13 +362,7 @@ def set_game_attribute(env: Any, name: str, value: Any) -> None:
 
 
 def check_is_parallel(env: Any, is_factory: bool) -> None:
-    """
-    Check that an object is a ParallelEnv with named agents; ``possible_agents`` becomes a list.
-
-    :param env: the argument of the user, or what a factory returned
-    :param is_factory: whether a factory returned it
-    :raises ValueError: if it is not, with a fix
-    """
+    """Raise ValueError unless an object (perhaps a factory's) is a ParallelEnv; ``possible_agents`` becomes a list."""
     origin = "a function that returned " if is_factory else ""
     if isinstance(env, AECEnv):
         raise ValueError(
@@ -412,12 +406,7 @@ def check_agents(env: Any, agents: Sequence[Any], place: str) -> None:
 
 
 def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
-    """
-    Return an agent's space.
-
-    :param kind: ``"observation"`` or ``"action"``
-    :raises ValueError: if it cannot be in rows
-    """
+    """Return the space of an agent's ``"observation"`` or ``"action"``; raise ValueError if it cannot be in rows."""
     method = getattr(env, f"{kind}_space")
     if not callable(method):
         raise ValueError(

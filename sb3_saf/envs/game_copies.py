@@ -310,10 +310,8 @@ def _play(
     game: TeamMarkovVectorEnv, rows: Any, n_steps: int, seconds: float = TRIAL_SECONDS
 ) -> tuple[Any, list[bytes]]:
     """
-    Play random legal actions, the same in each call.
+    Play random legal actions, the same in each call, until the time limit in seconds.
 
-    :param n_steps: steps to play
-    :param seconds: time limit, after which playing stops early
     :return: the last observations, and the serialised result of each step
     """
     space = deepcopy(game.action_space)

@@ -48,15 +48,9 @@ _UNCHANGING = (type(None), bool, int, float, str, np.bool_, np.int64, np.float32
 
 class TeamMarkovVectorEnv(MarkovVectorEnv):
     """
-    The agents of one game as rows that end together.
+    The agents of one game as rows that end together, see :class:`~sb3_saf.envs.supersuit_vec_env.SuperSuitVecEnv`.
 
-    Changes to :class:`supersuit.vector.MarkovVectorEnv`:
-
-    - an agent that has ended or not joined yet keeps its row, with zeros, or with ``"active"`` a copy of another's;
-    - rewards that the game pays to agents that do not act (after their end, while they are away) are in their rows;
-    - the last step's infos are kept: those of the next episode's reset are in ``reset_infos``;
-    - infos of done rows have ``"TimeLimit.truncated"`` and ``"terminal_observation"``;
-    - rows have signals on request: active agents, action masks, the game's state.
+    An agent that has ended or not joined yet keeps its row, with zeros, or with ``"active"`` a copy of another's.
     """
 
     par_env: AnyParallelEnv

@@ -65,12 +65,7 @@ def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
 
 
 def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_agents") -> int:
-    """
-    Check that the rows are a whole number of teams.
-
-    :return: E = B / N
-    :raises ValueError: if N does not divide B
-    """
+    """Return E = B / N; raise ValueError unless the rows are a whole number of teams."""
     if n_rows % n_agents:
         raise ValueError(
             f"expected rows of whole teams, a multiple of n_agents={n_agents}, got {n_rows} rows "
@@ -94,11 +89,7 @@ def import_by_name(module: str, name: str, what: str) -> Any:
 
 
 def check_form(name: str, value: Any, like: Any) -> None:
-    """
-    Compare names, shapes and dtypes of nested dicts and lists of arrays, as ``load_state_dict`` does.
-
-    :raises ValueError: naming the first difference
-    """
+    """Check names, shapes and dtypes of nested dicts and lists of arrays; the ValueError is of the first difference."""
     if isinstance(like, Mapping):
         if not isinstance(value, Mapping) or value.keys() != like.keys():
             found = list(value) if isinstance(value, Mapping) else type(value).__name__

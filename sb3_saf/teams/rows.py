@@ -255,11 +255,7 @@ class TeamSpaces:
         return spaces.Dict({OBS_KEY: self.own, **self._optional, **active})
 
     def entries(self, obs: Any, what: str) -> Mapping[str, Any]:
-        """
-        Return the parts of rows below ``CentralizedValueWrapper``.
-
-        :raises ValueError: if keys are missing
-        """
+        """Return the parts of rows below ``CentralizedValueWrapper``; raise ValueError if keys are missing."""
         if not self.is_dict:
             return {OBS_KEY: obs}
         keys = [OBS_KEY, *self._optional]
@@ -281,12 +277,7 @@ def n_mask_entries(action_space: spaces.Space[Any]) -> int | None:
 
 
 def choices_of(action_space: spaces.Space[Any]) -> tuple[int, ...]:
-    """
-    Return the number of choices of each action dimension, of which a Box has none.
-
-    :param action_space: Discrete, MultiDiscrete (of one axis), MultiBinary or Box
-    :raises ValueError: for any other space
-    """
+    """Return the number of choices of each action dimension, of which a Box has none; ValueError for other spaces."""
     if isinstance(action_space, spaces.Box):
         return ()
     if isinstance(action_space, spaces.Discrete):
