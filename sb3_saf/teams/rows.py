@@ -208,11 +208,6 @@ class TeamSpaces:
         low, high = (np.repeat(bound[np.newaxis], self.n_agents, axis=0) for bound in bounds_of(self.own))
         return spaces.Box(low, high, dtype=low.dtype.type)
 
-    @cached_property
-    def agent(self) -> AgentSpace:
-        """Discrete(N), the agent's index (key ``"agent"``)."""
-        return AgentSpace(self.n_agents, self.names, self.conversions)
-
     @property
     def active(self) -> spaces.MultiBinary | None:
         """MultiBinary(N), which agents of the team take part (key ``"active"``); None if all always do."""
@@ -238,10 +233,11 @@ class TeamSpaces:
         parts = {ACTIVE_KEY: self.active, ACTION_MASK_KEY: self.action_mask, STATE_KEY: self.state}
         return {key: part for key, part in parts.items() if part is not None}
 
-    @property
+    @cached_property
     def _joint(self) -> dict[str, spaces.Space[Any]]:
+        agent = AgentSpace(self.n_agents, self.names, self.conversions)
         starts = {EPISODE_START_KEY: spaces.Discrete(2)} if self.has_starts else {}
-        return {OBS_KEY: self.own, TEAM_KEY: self.team, AGENT_KEY: self.agent, **self._optional, **starts}
+        return {OBS_KEY: self.own, TEAM_KEY: self.team, AGENT_KEY: agent, **self._optional, **starts}
 
     def to_dict_space(self) -> spaces.Dict:
         """Return the joint observation space of a row; ``own`` stays the same object."""
