@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 
@@ -135,7 +134,7 @@ class Trial:
     def play(self, n_steps: int = TRIAL_STEPS, seconds: float = TRIAL_SECONDS) -> None:
         """Play one episode, at most ``n_steps`` steps and ``seconds``; the global random generators are restored."""
         deadline = time.monotonic() + seconds
-        with own_randomness(0, th.device("cpu")):
+        with own_randomness(0):
             self._place = "at the reset of a trial episode"
             result = self._called(reset, self.env, 0, None)
             if result is None:
@@ -171,7 +170,7 @@ class Trial:
 
     def check_seed(self) -> None:
         """Note that first observations differ in two resets with one seed."""
-        with own_randomness(0, th.device("cpu")):
+        with own_randomness(0):
             results = [self._called(reset, self.env, 0, None) for _ in range(2)]
         for agent in () if None in results else self._playing(frozenset()):
             seen = [read_leaves(self._leaves[agent], given[agent]) for given, _ in results if agent in given]

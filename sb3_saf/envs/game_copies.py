@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 import cloudpickle
 import numpy as np
 import numpy.typing as npt
-import torch as th
 from gymnasium import spaces
 from gymnasium.utils import EzPickle
 
@@ -231,7 +230,7 @@ def sign_games(tree: Any) -> None:
 
 def common_settings(make_game: Callable[[], Any]) -> dict[str, Any]:
     """Return the settings of new games, see :func:`settings_of`, without those that differ from game to game."""
-    with own_randomness(0, th.device("cpu")):
+    with own_randomness(0):
         games = [make_game(), make_game()]
     one, other = map(settings_of, games)
     for game in games:
@@ -253,7 +252,7 @@ def find_way(make_game: Callable[[], TeamMarkovVectorEnv]) -> Way:
     :raises CheckpointError: if there is no such way, with the difference found
     """
     reasons = []
-    with own_randomness(0, th.device("cpu")):
+    with own_randomness(0):
         for way in get_args(Way):
             reason = _trial(make_game, way)
             if reason is None:

@@ -48,13 +48,7 @@ class GameReader:
     :raises ValueError: if actions of different agents cannot be those of one policy, or a requested signal is missing
     """
 
-    def __init__(
-        self,
-        trial: Trial,
-        active: bool = False,
-        action_masks: AskMasks = "auto",
-        state: bool = False,
-    ) -> None:
+    def __init__(self, trial: Trial, active: bool, action_masks: AskMasks, state: bool) -> None:
         self.agents = trial.agents
         #: Warnings about the game.
         self.notes = list(trial.notes)

@@ -307,12 +307,7 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         return parts
 
     def _rows(
-        self,
-        obs: object,
-        raw: spaces.Space[Any],
-        stored: spaces.Space[Any],
-        what: str,
-        games: Sequence[int] | None = None,
+        self, obs: object, raw: spaces.Space[Any], stored: spaces.Space[Any], what: str, games: Sequence[int] | None
     ) -> Array:
         """Check and copy one entry of rows, channels first: (B, *raw shape) -> (B, *shape)."""
         rows = np.asarray(obs)

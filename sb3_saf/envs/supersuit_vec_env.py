@@ -104,13 +104,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         else:
             self._games = WorkerGames(self._make_game, reader, n_games, n_cpus)
         try:
-            super().__init__(
-                n_games,
-                len(reader.agents),
-                reader.rows.to_row_space(),
-                reader.action_space,
-                seed,
-            )
+            super().__init__(n_games, len(reader.agents), reader.rows.to_row_space(), reader.action_space, seed)
         except BaseException:
             self.close()
             raise

@@ -50,16 +50,16 @@ def set_generator_states(states: tuple[Any, Any]) -> None:
 
 
 @contextmanager
-def own_randomness(seed: int, device: th.device) -> Iterator[None]:
+def own_randomness(seed: int, device: th.device | None = None) -> Iterator[None]:
     """
     Seed all global generators temporarily, then restore their states.
 
     :param seed: seed of Python's, NumPy's and torch's generators
-    :param device: the model's device; on a GPU its generator is included
+    :param device: the model's device, if there is one; on a GPU its generator is included
     """
     states = generator_states()
     try:
-        with th.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        with th.random.fork_rng(devices=[device] if device is not None and device.type == "cuda" else []):
             random.seed(seed)
             np.random.seed(seed % 2**32)  # noqa: NPY002
             th.manual_seed(seed)
