@@ -7,18 +7,16 @@ Nothing in a file of plain data runs when it is read, and damage is detected: it
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import hashlib
-import io
 import json
 import os
 import uuid
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
-from io import BufferedWriter
+from io import BufferedWriter, BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -52,14 +50,14 @@ def atomic_file(path: Path) -> Iterator[BufferedWriter]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException as error:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             temporary.unlink()
         reason = error.__context__ if isinstance(error, RuntimeError) else error  # torch hides a full disk
         if isinstance(reason, OSError):
             number = reason.errno or errno.EIO
             raise OSError(number, f"cannot write {path}: {reason.strerror or reason}") from error
         raise
-    with contextlib.suppress(OSError):  # Windows cannot open folders
+    with suppress(OSError):  # Windows cannot open folders
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)  # the new name is on disk
@@ -220,14 +218,14 @@ def read_tree(file: BinaryIO) -> Tree:
 
 def encode(tree: Tree) -> bytes:
     """Return the content of a file, see :func:`write_tree`; the data are copied."""
-    file = io.BytesIO()
+    file = BytesIO()
     write_tree(file, tree)
     return file.getvalue()
 
 
 def decode(data: bytes) -> Tree:
     """Return the data in the content of a file, see :func:`read_tree`."""
-    return read_tree(io.BytesIO(data))
+    return read_tree(BytesIO(data))
 
 
 def _packed(value: Tree, where: str) -> Any:

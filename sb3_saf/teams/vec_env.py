@@ -249,19 +249,18 @@ def team_dones(dones: Array, n_agents: int, alone: bool = False) -> npt.NDArray[
     :raises ValueError: if the flags differ within a team
     """
     by_game = np.asarray(dones).astype(bool).reshape(-1, n_agents)
-    if not by_game.any():
+    if not by_game.any():  # as at most steps
         return np.zeros(len(by_game), dtype=np.bool_)
-    if alone:
-        return np.asarray(by_game.all(axis=1))
-    ended = by_game[:, 0]
-    if (by_game != ended[:, np.newaxis]).any():
-        game = int(np.flatnonzero((by_game != ended[:, np.newaxis]).any(axis=1))[0])
+    ended = np.asarray(by_game.all(axis=1))
+    differ = by_game.any(axis=1) & ~ended
+    if differ.any() and not alone:
+        game = int(differ.argmax())
         raise ValueError(
             f"expected one done flag for a whole team, got {by_game[game].tolist()} for the agents of game {game}; "
             "a team episode ends for all agents at once: keep agents that are out of the game as idle rows until then "
             "(sb3_saf.make_team_env does so), or check n_agents and the order of rows (game-major, then agent)"
         )
-    return ended.copy()
+    return ended
 
 
 def episode_value(infos: Iterable[Mapping[str, Any]], key: str) -> Any:
