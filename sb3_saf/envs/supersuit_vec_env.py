@@ -140,10 +140,8 @@ class SuperSuitVecEnv(TeamVecEnv):
             raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
         actions = self._actions
         self._begun, self._actions = False, None
-        observations, rewards, dones, infos, reset_infos, notes = self._run("play", actions)
+        observations, rewards, dones, infos, self.reset_infos, notes = self._run("play", actions)
         self._begun = True
-        for row in np.flatnonzero(dones).tolist():
-            self.reset_infos[row] = reset_infos[row]
         notes = [*notes, *self._note_beginnings(observations, np.flatnonzero(dones[:: self.n_agents]))]
         if notes and not self._has_warned:
             self._has_warned = True
