@@ -27,7 +27,7 @@ from hecogrid_envs.constants import (
     TreasureState,
 )
 from hecogrid_envs.constants import STEP as STEP_AHEAD
-from hecogrid_envs.core.occupancy import arrive, plane_offset
+from hecogrid_envs.core.occupancy import arrive
 from hecogrid_envs.core.rng import fresh_seed, generator_word
 from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers, Games, World
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, whole_number
@@ -59,7 +59,7 @@ def world_of(task: TaskName, params: HECOGridParams) -> World:
     released = params.rules == "released"
     atlases = turned_atlases(task, params.rules, params.view_tile_size)
     spread = [sum(0xFF << (8 * i) for i in range(8) if bits >> i & 1) for bits in range(256)]
-    world = World(
+    return World(
         condition=list(DECLARED).index(task),
         released=released,
         random_order=params.agent_order == "random",
@@ -83,15 +83,12 @@ def world_of(task: TaskName, params: HECOGridParams) -> World:
         shows_actions=params.agent_colours == "action",
         key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
         first_colour=BLUE_INDEX,
-        blank_planes=np.zeros(0, dtype=np.uint8),
-        blank_bits=np.zeros(0, dtype=np.uint8),
         spread=np.array(spread, dtype=np.uint64),
         swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
         tile=params.view_tile_size,
         atlas=np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)]),
         turn_bytes=0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size,
     )
-    return _with_blank_map(world)
 
 
 def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
@@ -104,20 +101,6 @@ def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
         seen |= lights << towards
         following |= lights << column | lights << towards
     return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
-
-
-def _with_blank_map(world: World) -> World:
-    """Return the world with the planes of an empty map, which resets copy. Cells beyond the map count as empty."""
-    planes = np.full((4, world.plane_bytes), FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8)
-    bits = np.zeros((4, world.bits_bytes), dtype=np.uint8)
-    outer = np.ones((world.width, world.width), dtype=bool)
-    outer[1:-1, 1:-1] = False
-    x, y = np.nonzero(outer)
-    for facing in range(4):
-        cells: npt.NDArray[Any] = plane_offset(world, facing, x, y)  # type: ignore[arg-type, assignment] # of all at once
-        planes[facing, cells] = FIRST_TERRAIN + Terrain.WALL
-        np.bitwise_or.at(bits[facing], cells >> 3, np.uint8(1) << (cells & 7).astype(np.uint8))
-    return world._replace(blank_planes=planes.reshape(-1), blank_bits=bits.reshape(-1))
 
 
 def empty_games(world: World, n_games: int) -> Games:
@@ -139,14 +122,14 @@ def empty_games(world: World, n_games: int) -> Games:
         order=np.zeros(agents, dtype=np.int32),
         sight=np.zeros(n_games * world.n_agents * world.view_size, dtype=np.uint64),
         sight_known=np.zeros(agents, dtype=np.uint8),
-        planes=np.zeros(n_games * 4 * world.plane_bytes, dtype=np.uint8),
+        # Cells beyond the map count as empty.
+        planes=np.full(n_games * 4 * world.plane_bytes, FIRST_TERRAIN + Terrain.EMPTY, dtype=np.uint8),
         wall_bits=np.zeros(n_games * 4 * world.bits_bytes, dtype=np.uint8),
         steps=np.zeros(n_games, dtype=np.int32),
         collected=np.zeros(n_games, dtype=np.int32),
         collected_now=np.zeros(n_games, dtype=np.int32),
     )
     games.order[...] = np.arange(world.n_agents)
-    games.planes.reshape(n_games, -1)[...] = world.blank_planes  # the outer wall and what lies beyond it stay
     return games
 
 

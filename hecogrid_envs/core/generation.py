@@ -95,9 +95,9 @@ def redraw(games: Games, world: World, e: int) -> None:
     """Derive the data that views need from terrain and agents."""
     bits = e * 4 * world.bits_bytes
     for i in range(4 * world.bits_bytes):
-        games.wall_bits[np.uint64(bits + i)] = world.blank_bits[np.uint64(i)]
-    for y in range(1, world.width - 1):
-        for x in range(1, world.width - 1):
+        games.wall_bits[np.uint64(bits + i)] = 0
+    for y in range(world.width):
+        for x in range(world.width):
             if games.terrain[e, np.uint64(y * world.width + x)] == _WALL:
                 set_wall_bits(games, world, e, x, y)
             redraw_cell(games, world, e, x, y)

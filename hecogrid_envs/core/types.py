@@ -45,8 +45,6 @@ class World(NamedTuple):
     :param shows_actions: whether an agent's colour tells its last action instead
     :param key_colour: palette index of an agent with a key
     :param first_colour: palette index of all agents after a reset, or -1 for their present colour
-    :param blank_planes: (4 * plane_bytes,) the planes of a map with only its outer wall
-    :param blank_bits: (4 * bits_bytes,) its wall bits
     :param spread: (256,) word whose byte i is 0xFF where bit i of the index is set
     :param swept: (4 ** V,) visibility table for one row of a view of at most eight columns: the index is the row's
         clear cells times 2 ** V plus its lit cells before the sweep, the entry its lit cells after it and, 8 bits
@@ -79,8 +77,6 @@ class World(NamedTuple):
     shows_actions: bool
     key_colour: int
     first_colour: int
-    blank_planes: U8
-    blank_bits: U8
     spread: U64
     swept: U16
     tile: int
