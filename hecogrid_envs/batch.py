@@ -45,9 +45,6 @@ _STORED: Final = (
 #: Kernels load whole words, so every byte array ends with room for one word per eight columns of a view.
 SLACK: Final = 64
 
-#: Visibility in views of at most this many columns is looked up in a table.
-_TABLED_COLUMNS: Final = 8
-
 
 def world_of(task: TaskName, params: HECOGridParams) -> World:
     """Return the data that all games of a batch share."""
@@ -84,23 +81,10 @@ def world_of(task: TaskName, params: HECOGridParams) -> World:
         key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
         first_colour=BLUE_INDEX,
         spread=np.array(spread, dtype=np.uint64),
-        swept=_swept_rows(view) if view <= _TABLED_COLUMNS else np.zeros(0, dtype=np.uint16),
         tile=params.view_tile_size,
         atlas=np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)]),
         turn_bytes=0 if params.view_tile_size <= MAX_CODED_TILE_SIZE else atlases[0].size,
     )
-
-
-def _swept_rows(size: int) -> npt.NDArray[np.uint16]:
-    """Return the table that :class:`~hecogrid_envs.core.types.World` calls ``swept``."""
-    cells, own = 1 << size, size // 2
-    clear, seen = np.divmod(np.arange(cells * cells), cells)
-    following = np.zeros_like(seen)
-    for column, towards in [(i, i + 1) for i in range(own, size)] + [(i, i - 1) for i in range(own + 1, 0, -1)]:
-        lights = (seen & clear) >> column & 1
-        seen |= lights << towards
-        following |= lights << column | lights << towards
-    return (seen % cells | following % cells << _TABLED_COLUMNS).astype(np.uint16)
 
 
 def empty_games(world: World, n_games: int) -> Games:

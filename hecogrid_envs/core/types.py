@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 U8 = npt.NDArray[np.uint8]
-U16 = npt.NDArray[np.uint16]
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]
 U64 = npt.NDArray[np.uint64]
@@ -46,9 +45,6 @@ class World(NamedTuple):
     :param key_colour: palette index of an agent with a key
     :param first_colour: palette index of all agents after a reset, or -1 for their present colour
     :param spread: (256,) word whose byte i is 0xFF where bit i of the index is set
-    :param swept: (4 ** V,) visibility table for one row of a view of at most eight columns: the index is the row's
-        clear cells times 2 ** V plus its lit cells before the sweep, the entry its lit cells after it and, 8 bits
-        higher, those of the next row
     :param tile: t
     :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction, and slack for whole chunks
     :param turn_bytes: bytes from one direction's tiles to the next; 0 if all directions may share the first
@@ -78,7 +74,6 @@ class World(NamedTuple):
     key_colour: int
     first_colour: int
     spread: U64
-    swept: U16
     tile: int
     atlas: U8
     turn_bytes: int

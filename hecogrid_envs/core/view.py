@@ -76,17 +76,12 @@ def look(games: Games, world: World, e: int, agent: int) -> None:
             walls = load_word(games.wall_bits, bits + (bit >> 3)) >> np.uint64(bit & 7)
             clear = ~walls & every
             seen = games.sight[np.uint64(words + row)]
-            if size <= _WORD_BYTES:
-                swept = np.uint64(world.swept[(clear << np.uint64(size)) | seen])
-                seen, lit = swept & _BYTE, swept >> np.uint64(_WORD_BYTES)
-            else:
-                right = _spread_right(seen & rightwards, clear & rightwards, size)
-                seen |= (right | (right << _ONE)) & every
-                left = _spread_left(seen & leftwards, clear & leftwards, size)
-                seen |= left | (left >> _ONE)
-                lit = right | (right << _ONE) | left | (left >> _ONE)
-            games.sight[np.uint64(words + row)] = seen
+            right = _spread_right(seen & rightwards, clear & rightwards, size)
+            seen |= (right | (right << _ONE)) & every
+            left = _spread_left(seen & leftwards, clear & leftwards, size)
+            games.sight[np.uint64(words + row)] = seen | left | (left >> _ONE)
             if 0 <= following < size:
+                lit = right | (right << _ONE) | left | (left >> _ONE)
                 games.sight[np.uint64(words + following)] |= lit & every
             row = following
     games.sight_known[e, agent] = 1
