@@ -7,7 +7,6 @@ Shapes are drawn at three times the size and averaged down, as MiniGrid does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Final
 
@@ -31,12 +30,11 @@ from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams
 from hecogrid_envs.task import DECLARED, TaskName
 
 Image = npt.NDArray[np.uint8]
-Shape = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.bool_]]
 
 INVISIBLE: Final = 0
 #: Code of a cell without agents and keys: ``FIRST_TERRAIN + terrain``.
 FIRST_TERRAIN: Final = 1
-#: Code of a key: ``FIRST_KEY + quarter turns`` of its picture, which turns with the map (see :func:`quarter_turns`).
+#: Code of a key: ``FIRST_KEY + quarter turns`` of its picture, which turns with the map.
 FIRST_KEY: Final = FIRST_TERRAIN + Terrain.KEY
 #: Code of an agent: ``FIRST_AGENT + (ground * len(AGENT_PALETTE) + colour) * 4 + direction relative to the viewer``,
 #: ground being 0 for a plain cell, 1 for an available and 2 for a collected treasure.
@@ -45,11 +43,6 @@ N_GROUNDS: Final = 3
 N_CODES: Final = FIRST_AGENT + N_GROUNDS * len(AGENT_PALETTE) * 4
 
 _SUPERSAMPLING: Final = 3
-
-
-def quarter_turns(facing: int) -> int:
-    """Count the counterclockwise quarter turns from the map, north up, to the view of a viewer facing ``facing``."""
-    return (facing + 1) % 4
 
 
 def tile_atlas(task: TaskName, rules: Rules, tile_size: int) -> Image:
@@ -84,11 +77,11 @@ def turned_atlases(task: TaskName, rules: Rules, tile_size: int) -> Image:
     code = FIRST_AGENT
     for ground in (None, available, collected):
         for colour in AGENT_PALETTE:
-            for direction in range(4):
-                agent = _drawn(_turned(_agent_shape, direction), colour, size)
-                tiles[code] = agent if ground is None else _blend(_solid(ground, size), agent)
-                code += 1
-    atlases = np.stack([_with_grid_lines(tiles, quarter_turns(facing)) for facing in Direction])
+            agent = _agent(colour, size) if ground is None else _blend(_solid(ground, size), _agent(colour, size))
+            tiles[code : code + 4] = [np.rot90(agent, -direction) for direction in range(4)]
+            code += 4
+    # From the map, north up, to a viewer facing a direction: counterclockwise quarter turns.
+    atlases = np.stack([_with_grid_lines(tiles, facing + 1) for facing in Direction])
     atlases.flags.writeable = False
     return atlases
 
@@ -97,10 +90,11 @@ def _solid(colour: Colour, size: int) -> Image:
     return np.full((size, size, 3), colour, dtype=np.uint8)
 
 
-def _canvas_points(size: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the centres of the supersampled pixels as x, y in [0, 1], each (3t, 3t)."""
-    centres = (np.arange(size * _SUPERSAMPLING) + 0.5) / (size * _SUPERSAMPLING)
-    return np.meshgrid(centres, centres)
+def _canvas(size: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], Image]:
+    """Return the centres of the supersampled pixels as x, y in [0, 1], each (3t, 3t), and the black pixels."""
+    side = size * _SUPERSAMPLING
+    centres = (np.arange(side) + 0.5) / side
+    return *np.meshgrid(centres, centres), np.zeros((side, side, 3), dtype=np.uint8)
 
 
 def _averaged(canvas: Image) -> Image:
@@ -110,33 +104,17 @@ def _averaged(canvas: Image) -> Image:
     return blocks.mean(axis=3).mean(axis=1).astype(np.uint8)
 
 
-def _drawn(shape: Shape, colour: Colour, size: int) -> Image:
-    canvas = np.zeros((size * _SUPERSAMPLING, size * _SUPERSAMPLING, 3), dtype=np.uint8)
-    canvas[shape(*_canvas_points(size))] = colour
-    return _averaged(canvas)
-
-
-def _agent_shape(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Return the mask of the triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81): an agent that faces east."""
+def _agent(colour: Colour, size: int) -> Image:
+    """Draw an agent that faces east: the triangle (0.12, 0.19), (0.87, 0.50), (0.12, 0.81)."""
+    x, y, canvas = _canvas(size)
     slope = (0.50 - 0.19) / (0.87 - 0.12)
-    return (x >= 0.12) & (y >= 0.19 + slope * (x - 0.12)) & (y <= 0.81 - slope * (x - 0.12))
-
-
-def _turned(shape: Shape, direction: int) -> Shape:
-    """Rotate a shape about the tile's centre from east to ``direction`` (clockwise, y grows downwards)."""
-    cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[direction]
-
-    def turned(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-        dx, dy = x - 0.5, y - 0.5
-        return shape(0.5 + cos * dx + sin * dy, 0.5 + cos * dy - sin * dx)
-
-    return turned
+    canvas[(x >= 0.12) & (y >= 0.19 + slope * (x - 0.12)) & (y <= 0.81 - slope * (x - 0.12))] = colour
+    return _averaged(canvas)
 
 
 def _key(size: int) -> Image:
     """Draw MiniGrid's key: a shaft with two teeth and a ring."""
-    x, y = _canvas_points(size)
-    canvas = np.zeros((size * _SUPERSAMPLING, size * _SUPERSAMPLING, 3), dtype=np.uint8)
+    x, y, canvas = _canvas(size)
     shaft = _in_rectangle(x, y, 0.50, 0.63, 0.31, 0.88)
     teeth = _in_rectangle(x, y, 0.38, 0.50, 0.59, 0.66) | _in_rectangle(x, y, 0.38, 0.50, 0.81, 0.88)
     radius_squared = (x - 0.56) ** 2 + (y - 0.28) ** 2
