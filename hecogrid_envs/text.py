@@ -17,7 +17,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from textwrap import wrap
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -43,13 +44,6 @@ _ZONE_DIGITS: Final = "0123456789abcdefghijklmnopqrstuvwxyz"
 _PAGE_WIDTH: Final = 100
 
 
-class _Agent(NamedTuple):
-    x: int
-    y: int
-    direction: int
-    has_key: bool
-
-
 def render_text(
     state: Mapping[str, Any],
     *,
@@ -70,41 +64,20 @@ def render_text(
         lines.append("  ".join(known))
     if zones is not None:
         lines.append("".join(_ZONE_DIGITS[int(zone) % len(_ZONE_DIGITS)] for zone in zones))
-    lines += ["".join(row) for row in _characters(state).T]
-    return "\n".join([*lines, *_agent_lines(state), LEGEND])
-
-
-def _characters(state: Mapping[str, Any]) -> npt.NDArray[np.str_]:
-    """Return the character of each cell, (W, H)."""
     treasures = np.asarray(state["treasures"])
-    characters = np.full(treasures.shape, FLOOR)
-    characters[np.asarray(state["walls"], dtype=bool)] = WALL
-    characters[treasures == TreasureState.AVAILABLE] = TREASURE
-    characters[treasures == TreasureState.COLLECTED] = COLLECTED
-    characters[np.asarray(state["keys"], dtype=bool)] = KEY
-    agents = _agents(state)
-    for agent in agents:
-        characters[agent.x, agent.y] = (CARRIER if agent.has_key else AGENT)[agent.direction]
-    for (x, y), count in Counter((agent.x, agent.y) for agent in agents).items():
-        if count > 1:
-            characters[x, y] = str(count) if count <= 9 else MANY
-    return characters
-
-
-def _agents(state: Mapping[str, Any]) -> list[_Agent]:
-    positions = np.asarray(state["agent_pos"]).reshape(-1, 2).tolist()
-    directions, keys = np.asarray(state["agent_dir"]).tolist(), np.asarray(state["agent_has_key"]).tolist()
-    return [_Agent(x, y, int(d), bool(key)) for (x, y), d, key in zip(positions, directions, keys, strict=True)]
-
-
-def _agent_lines(state: Mapping[str, Any]) -> list[str]:
-    """List the agents as ``index, direction, x,y, ground``, wrapped into lines of a page's width."""
-    grounds = {TreasureState.NONE: "", TreasureState.AVAILABLE: TREASURE, TreasureState.COLLECTED: COLLECTED}
-    lines: list[str] = []
-    for index, agent in enumerate(_agents(state)):
-        ground = grounds[TreasureState(int(state["treasures"][agent.x, agent.y]))]
-        word = f" {index}{(CARRIER if agent.has_key else AGENT)[agent.direction]}{agent.x},{agent.y}{ground}"
-        if not lines or len(lines[-1]) + len(word) > _PAGE_WIDTH:
-            lines.append("agents")
-        lines[-1] += word
-    return lines
+    ground = np.full(treasures.shape, FLOOR)
+    ground[np.asarray(state["walls"], dtype=bool)] = WALL
+    ground[treasures == TreasureState.AVAILABLE] = TREASURE
+    ground[treasures == TreasureState.COLLECTED] = COLLECTED
+    ground[np.asarray(state["keys"], dtype=bool)] = KEY
+    cells, crowds, words = ground.copy(), Counter[tuple[int, int]](), []
+    agents = zip(state["agent_pos"], state["agent_dir"], state["agent_has_key"], strict=True)
+    for index, ((x, y), direction, has_key) in enumerate(agents):
+        character = (CARRIER if has_key else AGENT)[direction]
+        words.append(f"{index}{character}{x},{y}{ground[x, y].replace(FLOOR, '')}")
+        crowds[x, y] += 1
+        count = crowds[x, y]
+        cells[x, y] = character if count == 1 else str(count) if count <= 9 else MANY
+    lines += ["".join(row) for row in cells.T]
+    lines += wrap(" ".join(words), _PAGE_WIDTH, initial_indent="agents ", subsequent_indent="agents ")
+    return "\n".join([*lines, LEGEND])
