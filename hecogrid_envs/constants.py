@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from itertools import permutations
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 Rules = Literal["paper", "released"]
 AgentOrder = Literal["random", "index"]
@@ -121,12 +119,3 @@ MAX_ZONES_AT_STRIDE: Final = 11
 def zone_colour(zone: int) -> Colour:
     """Return the colour of a zone in pictures for people."""
     return list(OKABE_ITO.values())[zone % len(OKABE_ITO)]
-
-
-def action_permutations() -> npt.NDArray[np.uint8]:
-    """
-    Return all orders of the seven actions, lexicographically.
-
-    :return: (5040, 7); in zone z command k is triggered by the action integer ``table[stride * z, k]``
-    """
-    return np.array(list(permutations(range(N_ACTIONS))), dtype=np.uint8)

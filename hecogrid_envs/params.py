@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from itertools import permutations
 from numbers import Real
 from typing import Any, get_args
 
@@ -12,12 +13,12 @@ import numpy.typing as npt
 
 from hecogrid_envs.constants import (
     MAX_ZONES_AT_STRIDE,
+    N_ACTIONS,
     ZONE_STRIDE,
     AgentColours,
     AgentOrder,
     Observation,
     Rules,
-    action_permutations,
 )
 from hecogrid_envs.task import DECLARED, TaskName, did_you_mean
 
@@ -188,7 +189,7 @@ class HECOGridParams:
         :return: (n_zones, 7), the command that action integer ``a`` triggers in zone ``z``
         """
         n_zones = int(self.zone_of_column().max()) + 1
-        table = action_permutations()
+        table = np.array(list(permutations(range(N_ACTIONS))))  # in lexicographic order, (5040, 7)
         few = self.heterogeneity <= MAX_ZONES_AT_STRIDE
         stride = ZONE_STRIDE if few else len(table) // self.heterogeneity
         action_of = table[(stride * np.arange(n_zones)) % len(table)]

@@ -77,7 +77,6 @@ class Session:
         self.over = False
         self.message = ""
         self._rng = np.random.default_rng(seed)
-        self._zones = env.params.zone_of_column()
         self._command_of = env.params.command_of()
         self.new_game(seed)
 
@@ -139,7 +138,7 @@ class Session:
         return int(np.flatnonzero(self._command_of[self._zone(agent)] == command)[0])
 
     def _zone(self, agent: int) -> int:
-        return int(self._zones[self.env.get_state()["agent_pos"][agent][0]])
+        return int(self.env.agent_zones[agent])
 
     @property
     def status(self) -> str:
