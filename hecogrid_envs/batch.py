@@ -117,18 +117,6 @@ def empty_games(world: World, n_games: int) -> Games:
     return games
 
 
-def take_snapshot(games: Games, seeded: npt.NDArray[np.bool_]) -> dict[str, npt.NDArray[Any]]:
-    """Copy E games: arrays by name; ``rank`` (E, N) counts the agents that arrived earlier in the same cell."""
-    ranks = np.zeros(games.before.shape, dtype=np.int32)
-    previous = games.before.astype(np.int64)
-    while (there := previous >= 0).any():
-        ranks += there
-        earlier = np.take_along_axis(games.before, np.maximum(previous, 0), axis=1)
-        previous = np.where(there, earlier, -1)
-    stored = {name: getattr(games, name).copy() for name in _STORED}
-    return {"seeded": seeded.copy(), **stored, "rank": ranks}
-
-
 def check_snapshot(snapshot: Snapshot, example: Snapshot, params: HECOGridParams) -> None:
     """
     Check that the kernels can index with a snapshot, whose values they do not check.
@@ -153,19 +141,6 @@ def check_snapshot(snapshot: Snapshot, example: Snapshot, params: HECOGridParams
             check_state(state_of(*(snapshot[name][game] for name in names)), params)
         except ValueError as error:
             raise ValueError(f"invalid snapshot: game {game}: {error}") from error
-
-
-def load_snapshot(games: Games, world: World, snapshot: Snapshot) -> None:
-    """Restore games from a checked snapshot; their cells must be redrawn afterwards."""
-    for name, empty in empty_games(world, len(games.rng))._asdict().items():
-        getattr(games, name)[...] = empty
-    begun = snapshot["seeded"]
-    for name in _STORED:
-        getattr(games, name)[begun] = snapshot[name][begun]
-    cells = games.y * world.width + games.x
-    for game in np.flatnonzero(begun).tolist():
-        for agent in np.argsort(snapshot["rank"][game], kind="stable").tolist():
-            arrive(games, game, agent, int(cells[game, agent]))
 
 
 U8 = npt.NDArray[np.uint8]
@@ -422,9 +397,17 @@ class GameBatch:
         """
         Copy the complete state of the games, random generators included; see :meth:`restore`.
 
-        :return: arrays by name, with games along the first axis
+        :return: arrays by name, with games along the first axis; ``rank`` (E, N) counts the agents that arrived earlier
+            in the same cell
         """
-        return take_snapshot(self._games, self._seeded)
+        before = self._games.before
+        ranks, previous = np.zeros(before.shape, dtype=np.int32), before.astype(np.int64)
+        while (there := previous >= 0).any():
+            ranks += there
+            earlier = np.take_along_axis(before, np.maximum(previous, 0), axis=1)
+            previous = np.where(there, earlier, -1)
+        stored = {name: getattr(self._games, name).copy() for name in _STORED}
+        return {"seeded": self._seeded.copy(), **stored, "rank": ranks}
 
     def restore(self, snapshot: Mapping[str, npt.NDArray[Any]]) -> None:
         """
@@ -435,9 +418,17 @@ class GameBatch:
             cells, directions, colours or agents; the games are then unchanged
         """
         check_snapshot(snapshot, self.snapshot(), self.params)
-        load_snapshot(self._games, self._world, snapshot)
+        games, begun = self._games, snapshot["seeded"]
+        for name, empty in empty_games(self._world, self.n_games)._asdict().items():
+            getattr(games, name)[...] = empty
+        for name in _STORED:
+            getattr(games, name)[begun] = snapshot[name][begun]
+        cells = games.y * self.params.grid_size + games.x
+        for game in np.flatnonzero(begun).tolist():
+            for agent in np.argsort(snapshot["rank"][game], kind="stable").tolist():
+                arrive(games, game, agent, int(cells[game, agent]))
         self._play(REDRAW)
-        self._seeded[...] = snapshot["seeded"]
+        self._seeded[...] = begun
         self._begun = False  # looked up at the next step
 
     def fields_of_view(self, game: int = 0) -> npt.NDArray[np.bool_]:

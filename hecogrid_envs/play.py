@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import fields
-from types import ModuleType
 from typing import Any, Final, Literal, get_args, get_type_hints
 
 import numpy as np
@@ -162,7 +161,7 @@ class HumanWindow:
         self.title = title
         self.fps = fps
         self.closed_by_user = False
-        self._pygame: ModuleType | None = None
+        self._pygame: Any = None
         self._screen: Any = None
         self._clock: Any = None
         self._keys: list[str] = []
@@ -201,11 +200,11 @@ class HumanWindow:
 
     def close(self) -> None:
         """Close the window; a later picture opens a new one unless the person closed this one."""
-        if self._pygame is not None and self.is_open:
+        if self.is_open:
             self._pygame.display.quit()
         self._screen = None
 
-    def _open(self, width: int, height: int) -> ModuleType:
+    def _open(self, width: int, height: int) -> Any:
         if self._pygame is None:
             os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
             try:
@@ -233,9 +232,9 @@ class HumanWindow:
         return pygame
 
     def _collect_events(self) -> None:
-        pygame = self._pygame
-        if pygame is None or not self.is_open:
+        if not self.is_open:
             return
+        pygame = self._pygame
         for event in pygame.event.get():
             if event.type == pygame.QUIT:
                 self._keys.append("quit")
