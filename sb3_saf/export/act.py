@@ -153,13 +153,12 @@ class Actor:
         rows, given = self._rows(observation, action_mask)
         by_agent = given is not None and given.agents is not None
         states = self._states(memory, by_agent)
-        is_drawn = not deterministic and not self.description["greedy"]
-        generator = self._rng if rng is None else None
-        if is_drawn and rng is not None:
-            if isinstance(rng, bool) or not isinstance(rng, (int, np.integer, np.random.Generator)):
+        generator = None
+        if not deterministic and not self.description["greedy"]:
+            if isinstance(rng, bool) or not isinstance(rng, (int, np.integer, np.random.Generator, type(None))):
                 raise ValueError(f"rng must be a seed, a numpy.random.Generator or None, got {rng!r}")
-            generator = np.random.default_rng(rng)
-        predict = partial(self._predict, generator=generator if is_drawn else None)
+            generator = self._rng if rng is None else np.random.default_rng(rng)
+        predict = partial(self._predict, generator=generator)
         if given is None:
             actions, after = predict(rows, states)
         else:
@@ -180,9 +179,8 @@ class Actor:
         """Return actions for rows, drawn if there is a generator, and the states after them."""
         inputs, is_batch = self._inputs({"action_mask": action_masks, **rows}, states)
         names = ["most_likely" if generator is None else "drawn"]
-        actions, *after = self._run(
-            [*names, *(f"next_{name}" for name in self.description["states"])], inputs, generator
-        )
+        names += [f"next_{name}" for name in self.description["states"]]
+        actions, *after = self._run(names, inputs, generator)
         return (actions if is_batch else actions.squeeze(axis=0)), after or None
 
     def _rows(self, observation: Any, action_mask: Any) -> tuple[dict[str, Any], Given | None]:
