@@ -7,6 +7,7 @@ tile codes) are computed on loading. Letters: E games, N agents, W columns and r
 
 from __future__ import annotations
 
+import secrets
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -28,8 +29,8 @@ from hecogrid_envs.constants import (
 )
 from hecogrid_envs.constants import STEP as STEP_AHEAD
 from hecogrid_envs.core.occupancy import arrive
-from hecogrid_envs.core.rng import fresh_seed, generator_word
-from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, Buffers, Games, World
+from hecogrid_envs.core.rng import generator_word
+from hecogrid_envs.core.types import BEGIN, PICTURES, REDRAW, RESET, RESTART, STEP, TILES, U8, Buffers, Games, World
 from hecogrid_envs.params import MAX_CODED_TILE_SIZE, HECOGridParams, whole_number
 from hecogrid_envs.state import StateMapping, check_state, state_of
 from hecogrid_envs.task import DECLARED, TaskName, check_task
@@ -136,14 +137,11 @@ def check_snapshot(snapshot: Snapshot, example: Snapshot, params: HECOGridParams
     if (np.sort(snapshot["order"], axis=1) != np.arange(params.n_agents)).any():
         raise ValueError("invalid snapshot: `order` is not a permutation of the agents")
     for game in np.flatnonzero(snapshot["seeded"]).tolist():
-        names = ("terrain", "x", "y", "direction", "has_key")
         try:
-            check_state(state_of(*(snapshot[name][game] for name in names)), params)
+            check_state(state_of(snapshot, game), params)
         except ValueError as error:
             raise ValueError(f"invalid snapshot: game {game}: {error}") from error
 
-
-U8 = npt.NDArray[np.uint8]
 
 #: Passed where no views are requested.
 _NO_VIEWS: Final[U8] = np.zeros(0, dtype=np.uint8)
@@ -235,7 +233,7 @@ class GameBatch:
     def _seed(self, game: int, seed: int | None) -> None:
         if seed is None and self._seeded[game]:
             return
-        self._games.rng[game] = generator_word(fresh_seed() if seed is None else seed)
+        self._games.rng[game] = generator_word(secrets.randbits(63) if seed is None else seed)
         # Released rules keep directions from the last episode; a seed starts the history anew, facing east.
         self._games.direction[game] = 0
         self._seeded[game] = True
@@ -367,9 +365,7 @@ class GameBatch:
 
     def get_state(self, game: int = 0) -> StateMapping:
         """Copy the state of one game (see :class:`~hecogrid_envs.state.StateMapping`)."""
-        game = whole_number("game", game, 0, self.n_games - 1)
-        games = self._games
-        return state_of(*(each[game] for each in (games.terrain, games.x, games.y, games.direction, games.has_key)))
+        return state_of(self._games._asdict(), whole_number("game", game, 0, self.n_games - 1))
 
     def set_state(self, mapping: object, game: int = 0) -> None:
         """

@@ -91,22 +91,13 @@ def check_state(mapping: object, params: HECOGridParams) -> StateMapping:
     return state
 
 
-def state_of(
-    terrain: npt.NDArray[Any],
-    x: npt.NDArray[Any],
-    y: npt.NDArray[Any],
-    direction: npt.NDArray[Any],
-    has_key: npt.NDArray[Any],
-) -> StateMapping:
+def state_of(games: Mapping[str, npt.NDArray[Any]], game: int) -> StateMapping:
     """
-    Return the state of a game of a batch.
+    Return the state of one game.
 
-    :param terrain: (W * H,) :class:`~hecogrid_envs.constants.Terrain`, row by row
-    :param x: (N,) columns of the agents
-    :param y: (N,) their rows
-    :param direction: (N,)
-    :param has_key: (N,)
+    :param games: arrays of E games by name: :class:`~hecogrid_envs.core.types.Games`, or a snapshot
     """
+    terrain, x, y, direction, has_key = (games[name][game] for name in ("terrain", "x", "y", "direction", "has_key"))
     width = math.isqrt(terrain.size)
     terrain = terrain.reshape(width, width).T
     treasures = np.zeros((width, width), dtype=np.uint8)

@@ -6,7 +6,6 @@ The generator's whole state is one word per game, so a game does not depend on t
 
 from __future__ import annotations
 
-import secrets
 from numbers import Integral
 
 import numpy as np
@@ -20,12 +19,6 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
 
 
-def check_seed(seed: object) -> None:
-    """Raise ValueError unless a value is a valid seed: None or an integer of at least 0."""
-    if seed is not None and (isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0):
-        raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
-
-
 def generator_word(seed: int) -> np.uint64:
     """
     Return the first state of a game's random generator.
@@ -33,14 +26,10 @@ def generator_word(seed: int) -> np.uint64:
     :param seed: 0 or larger, of any size
     :raises ValueError: for anything else
     """
-    check_seed(seed)
+    if isinstance(seed, (bool, np.bool_)) or not isinstance(seed, Integral) or seed < 0:
+        raise ValueError(f"seed must be an integer of at least 0, or None, got {seed!r}")
     word: np.uint64 = np.random.SeedSequence(int(seed)).generate_state(1, np.uint64)[0]
     return word
-
-
-def fresh_seed() -> int:
-    """Draw a seed from the operating system, for unseeded games; no global generator is used."""
-    return secrets.randbits(63)
 
 
 @inlined
