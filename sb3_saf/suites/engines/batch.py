@@ -13,7 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_saf.envs.audit import settings_of
-from sb3_saf.teams.checks import check_count, check_form
+from sb3_saf.teams.checks import check_form
 from sb3_saf.teams.rows import (
     ACTIVE_KEY,
     IS_SUCCESS,
@@ -131,11 +131,7 @@ class ResumableBatch(Batch):
 
 class BatchVecEnv(TeamVecEnv):
     """
-    VecEnv of a batch of games: row ``e * N + i`` is agent ``i`` of game ``e``.
-
-    Observations of rows are own observations, or Dicts, see :class:`sb3_saf.teams.rows.TeamSpaces`. Infos of done rows
-    hold ``"terminal_observation"`` and ``"TimeLimit.truncated"``; that of agent 0 also ``"is_success"`` if the suite
-    reports wins.
+    VecEnv of a batch of games: row ``e * N + i`` is agent ``i`` of game ``e``; see :mod:`sb3_saf.suites`.
 
     :param seed: game ``e`` starts from ``game_seeds(seed, E)[e]``; None draws from the operating system
     :param render_mode: None or ``"rgb_array"``; games with objects of their own take all that these know
@@ -154,14 +150,12 @@ class BatchVecEnv(TeamVecEnv):
         self.possible_agents = list(batch.agents)
         self.shares_reward = batch.shares_reward
         self.render_mode = render_mode
-        self.metadata = {"render_modes": ["rgb_array"]}
         self._actions: Array | None = None
         self._running = False
         self._stagger = stagger
-        n_games = check_count("n_envs", batch.n_games)
         #: Games in an episode that is shorter than others, (E,).
-        self._is_short = np.zeros(n_games, dtype=np.bool_)
-        super().__init__(n_games, len(batch.agents), batch.rows.to_row_space(), batch.action_space, seed)
+        self._is_short = np.zeros(batch.n_games, dtype=np.bool_)
+        super().__init__(batch.n_games, len(batch.agents), batch.rows.to_row_space(), batch.action_space, seed)
 
     def settings(self) -> dict[str, Any]:
         """Return what the games are, and whether first episodes are shortened (see the base class)."""
