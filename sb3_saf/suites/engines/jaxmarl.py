@@ -12,7 +12,6 @@ import inspect
 import io
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
 from functools import cached_property, lru_cache, partial
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
@@ -109,10 +108,9 @@ class JaxPrograms:
         self.agents: list[Any] = list(env.agents)
         key = jax.random.PRNGKey(0)
         observations, self._state_form = jax.eval_shape(env.reset, key)
-        self._observations = {agent: observations[agent] for agent in self.agents}
         self._has_world_entry = _WORLD_STATE in observations
         self._action_spaces = [env.action_space(agent) for agent in self.agents]
-        width = max(_size(one) for one in self._observations.values())
+        width = max(_size(observations[agent]) for agent in self.agents)
         counts = self._n_actions
         has_masks = bool(counts) and (self.legal_actions is not None or len(set(counts)) > 1)
         self.rows = TeamSpaces(
@@ -369,8 +367,6 @@ class JaxGames(ResumableBatch):
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Restore a snapshot (see the base class)."""
-        if self._buffers is None:
-            self.reset([0] * self.n_games)
         own, tree = jax.tree_util.tree_flatten_with_path(self.games)
         games = jax.tree.unflatten(tree, [jnp.array(state[jax.tree_util.keystr(path)]) for path, _ in own])
         self._buffers = jax.vmap(self._programs.packing.pack)(games)
@@ -489,28 +485,16 @@ def registered() -> list[str]:
     return [name for name in names if SUBMODULE_ENVIRONMENTS or not name.startswith("JaxRobotarium")]
 
 
-class _Params:
-    """Arguments of an environment as they are now, compared by value."""
-
-    def __init__(self, params: Mapping[str, Any]) -> None:
-        self.params = deepcopy(dict(params))
-        self._key = tuple((name, cloudpickle.dumps(value)) for name, value in sorted(params.items()))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Params) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
 @lru_cache(_N_KEPT)
-def _programs(name: str, params: _Params, with_state: bool) -> JaxPrograms:
+def _programs(name: str, pickled: tuple[tuple[str, bytes], ...], with_state: bool) -> JaxPrograms:
+    """Make an environment with arguments as they are now, compared by value."""
+    params = {key: cloudpickle.loads(value) for key, value in pickled}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # Overcooked recommends its second version
-        env = jaxmarl.make(name, **params.params)
+        env = jaxmarl.make(name, **params)
     if name.startswith(_PARTICLES):  # which ignore parameters that they do not know
         known = {one for base in type(env).__mro__ for one in inspect.signature(base).parameters} | set(vars(env))
-        if unknown := sorted(params.params.keys() - known):
+        if unknown := sorted(params.keys() - known):
             raise ValueError(
                 f"{name} has no parameters {unknown}; its number of agents is num_agents, its time limit max_steps"
             )
@@ -542,7 +526,8 @@ def vec_env(
     """
     if params.keys() & (fixed or {}).keys():
         raise ValueError(f"expected no {' or '.join(fixed or {})}, which the task's name sets; choose another task")
-    programs = _programs(name, _Params({**params, **(fixed or {})}), state)
+    given = sorted({**params, **(fixed or {})}.items())
+    programs = _programs(name, tuple((key, cloudpickle.dumps(value)) for key, value in given), state)
     if reward_shaping and programs.rules.extra_reward is None:
         raise ValueError(f"{name} has no rewards for steps on the way, got reward_shaping={reward_shaping}")
     if render_mode is not None and programs.rules.draw is None:
