@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import jax
+import jaxmarl
 import numpy as np
 import numpy.typing as npt
 
 from sb3_saf.experiments.results import BEST_MODEL
-from sb3_saf.suites.engines.jaxmarl import JaxPrograms, rules_of
-from sb3_saf.suites.engines.jaxmarl_package import MAP_NAME_TO_SCENARIO, jaxmarl
+from sb3_saf.suites.engines.jaxmarl import SCENARIOS, JaxPrograms, rules_of
 from sb3_saf.teams.rows import Array
 from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import Run
@@ -52,7 +52,7 @@ class Battles:
         run = Run(folder)
         with closing(run.settings.make_env(run.seed, evaluation=True, n_envs=1)) as games:
             self._policy = make_policy(run.settings, folder / BEST_MODEL, games)
-        env = jaxmarl.make(_NAME, scenario=MAP_NAME_TO_SCENARIO[run.settings.environment.task])
+        env = jaxmarl.make(_NAME, scenario=SCENARIOS[run.settings.environment.task])
         self._programs = JaxPrograms(env, rules_of(_NAME))
         self._random = np.random.default_rng(seed)
 

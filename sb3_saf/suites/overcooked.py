@@ -15,16 +15,15 @@ from sb3_saf.suites.registry import Suite
 
 
 def _tasks() -> list[str]:
-    from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts
+    from sb3_saf.suites.engines.jaxmarl import LAYOUTS
 
-    return list(overcooked_layouts)
+    return list(LAYOUTS)
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl import vec_env
-    from sb3_saf.suites.engines.jaxmarl_package import overcooked_layouts
+    from sb3_saf.suites.engines.jaxmarl import LAYOUTS, vec_env
 
-    return vec_env("overcooked", n_envs, seed, fixed={"layout": overcooked_layouts[task]}, **params)
+    return vec_env("overcooked", n_envs, seed, fixed={"layout": LAYOUTS[task]}, **params)
 
 
 SUITE: Final = Suite(

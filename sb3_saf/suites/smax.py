@@ -16,16 +16,15 @@ from sb3_saf.suites.registry import Suite
 
 
 def _tasks() -> list[str]:
-    from sb3_saf.suites.engines.jaxmarl_package import MAP_NAME_TO_SCENARIO
+    from sb3_saf.suites.engines.jaxmarl import SCENARIOS
 
-    return list(MAP_NAME_TO_SCENARIO)
+    return list(SCENARIOS)
 
 
 def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
-    from sb3_saf.suites.engines.jaxmarl import vec_env
-    from sb3_saf.suites.engines.jaxmarl_package import MAP_NAME_TO_SCENARIO
+    from sb3_saf.suites.engines.jaxmarl import SCENARIOS, vec_env
 
-    return vec_env("HeuristicEnemySMAX", n_envs, seed, fixed={"scenario": MAP_NAME_TO_SCENARIO[task]}, **params)
+    return vec_env("HeuristicEnemySMAX", n_envs, seed, fixed={"scenario": SCENARIOS[task]}, **params)
 
 
 SUITE: Final = Suite(

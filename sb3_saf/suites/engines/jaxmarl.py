@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import io
+import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache, partial
@@ -23,10 +24,19 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+# JaxMARL resets ``sys.stdout`` and ``sys.stderr`` of notebooks and tests: undone here.
+with contextlib.redirect_stdout(sys.stdout), contextlib.redirect_stderr(sys.stderr):
+    import jaxmarl
+    from jaxmarl.environments import MABRAX_AVAILABLE, SUBMODULE_ENVIRONMENTS, overcooked_layouts
+    from jaxmarl.environments import spaces as jax_spaces
+    from jaxmarl.environments.smax.smax_env import MAP_NAME_TO_SCENARIO
+
 from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch, ResumableBatchVecEnv
-from sb3_saf.suites.engines.jaxmarl_package import MABRAX_AVAILABLE, SUBMODULE_ENVIRONMENTS, jaxmarl
-from sb3_saf.suites.engines.jaxmarl_package import spaces as jax_spaces
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
+
+#: What the tasks of Overcooked and SMAX set, by their names.
+LAYOUTS: Final[Mapping[str, Any]] = overcooked_layouts
+SCENARIOS: Final[Mapping[str, Any]] = MAP_NAME_TO_SCENARIO
 
 _ALL: Final = "__all__"
 _PARTICLES: Final = "MPE_"
