@@ -101,10 +101,10 @@ def test_scores_become_matrices_of_seeds_and_tasks() -> None:
     with pytest.raises(ValueError, match="saf has no seed 0 on b"):
         score_matrices(table.drop(index=1))
     other = pd.DataFrame([("ippo", 0, "a", 1.0)], columns=table.columns)
-    with pytest.raises(ValueError, match="on the same tasks: ippo has no result on b"):
+    with pytest.raises(ValueError, match="ippo has no seed 0 on b"):
         score_matrices(pd.concat([table, other]))
     elsewhere = pd.DataFrame([("ippo", seed, task, 1.0) for seed in (0, 1) for task in "cd"], columns=table.columns)
-    with pytest.raises(ValueError, match="on the same tasks: saf has no result on c, d"):
+    with pytest.raises(ValueError, match="ippo has no seed 0 on a, b"):
         score_matrices(pd.concat([table, elsewhere]))
 
 

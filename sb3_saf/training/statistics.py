@@ -96,26 +96,14 @@ def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Float
     :raises ValueError: if a method lacks a task, or a seed of one
     """
     require_columns(results, ("method", "seed", task, "score"))
-    matrices: dict[str, Floats] = {}
-    tasks: dict[str, set[Any]] = {}
-    for method, rows in results.groupby("method", sort=False):
-        table = rows.groupby(["seed", task])["score"].mean().unstack(task)
-        if table.isna().to_numpy().any():
-            seed, column = next((s, c) for s in table.index for c in table.columns if pd.isna(table.loc[s, c]))
+    table = results.groupby(["method", "seed", task])["score"].mean().unstack(task)
+    for (method, seed), is_missing in table.isna().T.items():
+        if is_missing.any():
             raise ValueError(
-                f"aggregates need every seed of a method on every task: {method} has no seed {seed} on {column}; run "
-                "it, or leave that seed or task out"
+                f"aggregates need every seed of a method on every task: {method} has no seed {seed} on "
+                f"{', '.join(map(str, table.columns[is_missing]))}; run it, or leave that method, seed or task out"
             )
-        matrices[str(method)] = table.to_numpy(dtype=np.float64)
-        tasks[str(method)] = set(table.columns)
-    everything = set().union(*tasks.values())
-    for method, its in tasks.items():
-        if its != everything:
-            raise ValueError(
-                f"aggregates compare methods on the same tasks: {method} has no result on "
-                f"{', '.join(sorted(map(str, everything - its)))}; run it, or leave that method or task out"
-            )
-    return matrices
+    return {str(method): table.loc[method].to_numpy(dtype=np.float64) for method in results["method"].unique()}
 
 
 def interquartile_means(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
@@ -134,8 +122,8 @@ def optimality_gaps(scores: Mapping[str, Floats]) -> dict[str, Estimate]:
     return _estimates(scores, lambda runs: float(1 - np.minimum(runs, 1).mean()))
 
 
-def _estimates(scores: Mapping[str, Floats], statistic: Callable[[Floats], float]) -> dict[str, Estimate]:
-    profiles = _bootstrap(scores, lambda runs: np.array([statistic(runs)]))
+def _estimates(scores: Mapping[str, Any], statistic: Callable[..., float]) -> dict[str, Estimate]:
+    profiles = _bootstrap(scores, lambda *runs: np.array([statistic(*runs)]))
     return {method: Estimate(*(float(part[0]) for part in parts)) for method, parts in profiles.items()}
 
 
@@ -149,12 +137,11 @@ def probability_of_improvement(first: Floats, second: Floats) -> Estimate:
     :param second: (S', K) scores
     """
 
-    def probability(x: Floats, y: Floats) -> Floats:
+    def probability(x: Floats, y: Floats) -> float:
         pairs = x[:, np.newaxis], y[np.newaxis]
-        return np.array([np.mean(pairs[0] > pairs[1]) + 0.5 * np.mean(pairs[0] == pairs[1])])
+        return float(np.mean(pairs[0] > pairs[1]) + 0.5 * np.mean(pairs[0] == pairs[1]))
 
-    parts = _bootstrap({"": [first, second]}, probability)[""]
-    return Estimate(*(float(part[0]) for part in parts))
+    return _estimates({"": [first, second]}, probability)[""]
 
 
 def performance_profiles(scores: Mapping[str, Floats], thresholds: Floats) -> dict[str, Profile]:
