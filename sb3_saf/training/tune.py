@@ -100,19 +100,19 @@ def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class TrialReport(BaseCallback):
-    """Report every evaluation to a trial, and stop training if the pruner stops the trial."""
+    """Report every evaluation to a trial, and end the trial if the pruner stops it."""
 
     def __init__(self, trial: optuna.Trial) -> None:
         super().__init__()
         self.trial = trial
-        self.is_pruned = False
 
     def _on_step(self) -> bool:
         evaluation = self.parent
         assert isinstance(evaluation, SeededEvalCallback)
         self.trial.report(float(evaluation.last_mean_reward), evaluation.n_evaluations)
-        self.is_pruned = self.trial.should_prune()
-        return not self.is_pruned
+        if self.trial.should_prune():
+            raise optuna.TrialPruned
+        return True
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,13 @@ def optimize(
         pruner = optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
     elif tuning.pruner == "median":
         pruner = optuna.pruners.MedianPruner(tuning.n_startup_trials, n_warmup_steps=tuning.n_evaluations // 3)
+    # Workers of one storage with equal seeds would all propose the same trials.
+    seed = tuning.seed if tuning.storage is None else None
+    sampler: optuna.samplers.BaseSampler = optuna.samplers.RandomSampler(seed=seed)
+    if tuning.sampler == "tpe":
+        sampler = optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=seed, multivariate=True)
     study = optuna.create_study(
-        sampler=_make_sampler(tuning),
+        sampler=sampler,
         pruner=pruner,
         storage=None if tuning.storage is None else open_storage(tuning.storage),
         study_name=tuning.study_name,
@@ -185,11 +190,10 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
     :raises optuna.TrialPruned: if the pruner stops it, training fails, or the value is not finite
     """
     seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
-    report = TrialReport(trial)
     options = replace(
         tuning.options,
         eval_freq=max(1, settings.game_steps // tuning.n_evaluations),
-        after_evaluation=report,
+        after_evaluation=TrialReport(trial),
         checkpoint_freq=0,
     )
     try:
@@ -200,17 +204,9 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
         raise optuna.TrialPruned(str(error)) from error
     assert training.evaluation is not None
     value = float(training.evaluation.last_mean_reward)
-    if report.is_pruned or not math.isfinite(value):
+    if not math.isfinite(value):
         raise optuna.TrialPruned(f"the trial ended with a team return of {value}")
     return value
-
-
-def _make_sampler(tuning: Tuning) -> optuna.samplers.BaseSampler:
-    # Workers of one storage with equal seeds would all propose the same trials.
-    seed = tuning.seed if tuning.storage is None else None
-    if tuning.sampler == "random":
-        return optuna.samplers.RandomSampler(seed=seed)
-    return optuna.samplers.TPESampler(n_startup_trials=tuning.n_startup_trials, seed=seed, multivariate=True)
 
 
 # --- storages ---------------------------------------------------------------------------------------------------------
