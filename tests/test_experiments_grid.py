@@ -19,7 +19,6 @@ from sb3_saf.experiments.definitions import (
     Selection,
     Shard,
     expand,
-    find_experiment,
     merge,
     own_experiment,
 )
@@ -37,7 +36,7 @@ def at(coordination: int, heterogeneity: int) -> Level:
 
 
 def grid_of(name: str, config: RunConfig = PAPER, selection: Selection = THREE_SEEDS) -> list[Cell]:
-    return expand(find_experiment(name), selection, config)
+    return expand(EXPERIMENTS[name], selection, config)
 
 
 def trained(cells: list[Cell]) -> list[Cell]:
@@ -70,7 +69,7 @@ def test_number_of_cells(name: str, n_trained: int, n_random: int) -> None:
 
 
 def test_levels_of_the_paper() -> None:
-    levels = {name: list(find_experiment(name).tests()) for name in SIZES}
+    levels = {name: list(EXPERIMENTS[name].tests()) for name in SIZES}
     assert levels["coordination"] == [at(1, 1), at(2, 1), at(3, 1)]
     assert levels["heterogeneity"] == [at(1, h) for h in (1, 2, 3, 4, 5)]
     assert levels["joint"] == [at(2, 2), at(3, 3), at(4, 4)]
@@ -153,7 +152,7 @@ def test_some_levels_only(name: str, levels: str, trains: set[Level], tests: set
     assert {cell.level for cell in cells if cell.is_trained} == trains
     assert {level for cell in cells for level in cell.tests} == tests
     everything = grid_of(name, selection=Selection((0,)))
-    assert {cell.id for cell in everything if part.has(cell, find_experiment(name))} == {cell.id for cell in cells}
+    assert {cell.id for cell in everything if part.has(cell, EXPERIMENTS[name])} == {cell.id for cell in cells}
 
 
 def test_levels_that_are_not_there_are_refused() -> None:
@@ -215,7 +214,7 @@ def test_plan_lists_cells_and_totals(capsys: pytest.CaptureFixture[str], tmp_pat
 
 def test_plan_counts_what_is_finished(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     config = RunConfig("smoke", {}, 16, 200, 2)
-    run(find_experiment("joint"), Selection((0,), ("ippo",), (), ("2", "3")), config, Results(tmp_path), InlineEngine())
+    run(EXPERIMENTS["joint"], Selection((0,), ("ippo",), (), ("2", "3")), config, Results(tmp_path), InlineEngine())
     capsys.readouterr()
     words = ["plan", "joint", "-f", str(tmp_path), "--levels", "2", "3", "--methods", "ippo", "--seeds", "0"]
     printed = output(capsys, *words, "1")

@@ -20,7 +20,7 @@ import pytest
 
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, run_job
-from sb3_saf.experiments.definitions import Cell, RunConfig, Selection, find_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, Cell, RunConfig, Selection
 from sb3_saf.experiments.engines import RayEngine, _run_on_ray, inputs_of, require_ray
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
@@ -127,7 +127,7 @@ def is_cell(process: psutil.Process) -> bool:
 
 
 def test_the_table_is_that_of_this_machine_though_a_node_is_killed(cluster: Any, tmp_path: Path) -> None:
-    joint, engine = find_experiment("joint"), NodeKiller(cluster)
+    joint, engine = EXPERIMENTS["joint"], NodeKiller(cluster)
     assert run(joint, CHOICE, SMOKE, Results(tmp_path / "ray"), engine) == Summary(4, [], [])
     assert engine.lost
     assert all("NodeDied" in str(error) for error in engine.lost)
@@ -168,7 +168,7 @@ def test_ray_on_this_machine_listens_on_localhost_only_and_knows_its_size() -> N
 def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint_and_a_job_that_is_none_fails(
     cluster: Any, tmp_path: Path
 ) -> None:
-    experiment = find_experiment("joint")
+    experiment = EXPERIMENTS["joint"]
     (level, *_) = experiment.tests()
     job = Job(
         Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 1_000}, 32, 500, 2)
@@ -202,7 +202,7 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint_and_a_job_tha
 @pytest.mark.parametrize(("is_shared", "is_trained"), [(True, False), (False, False), (False, True)])
 def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, is_trained: bool, tmp_path: Path) -> None:
     """On such a node, killed cells resume; to and from other nodes, trained models and results are sent."""
-    experiment = find_experiment("joint")
+    experiment = EXPERIMENTS["joint"]
     (level, *_) = experiment.tests()
     job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}, 32, 40, 2))
     for name in ("here", "there"):

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, expand, find_experiment, own_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, expand, own_experiment
 from sb3_saf.experiments.report import Content, known, losses
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("coordination")
     selection = Selection((0, 1), ("saf", "ippo"), tuple(f"{task}-v0" for task in TASKS), ("1", "2"))
     config = RunConfig("smoke", {"n_epochs": 1, "game_steps": 80}, 16, 40, 2)
-    assert run(find_experiment("coordination"), selection, config, Results(path), InlineEngine()).finished == N_CELLS
+    assert run(EXPERIMENTS["coordination"], selection, config, Results(path), InlineEngine()).finished == N_CELLS
     return path
 
 
@@ -295,7 +295,7 @@ def test_aggregates_compare_like_with_like() -> None:
 
 
 def test_results_stand_beside_what_is_known_of_the_same_games(tmp_path: Path) -> None:
-    experiment, results = find_experiment("coordination"), Results(tmp_path)
+    experiment, results = EXPERIMENTS["coordination"], Results(tmp_path)
     config, cells = RunConfig("small"), expand(experiment, Selection((0,), ("saf",)), RunConfig("small"))
     rows = [("TeamSupport", "saf", "c2-h1", "c2-h1", math.nan, 17.0, 200_000)]
     names = ["task", "method", "train_level", "level", "success_rate", "return_mean", "game_steps"]

@@ -25,7 +25,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_saf import EvaluationResult, TeamMonitor
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, play, run_job
-from sb3_saf.experiments.definitions import RANDOM, Cell, Level, RunConfig, Selection, Shard, find_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, RANDOM, Cell, Level, RunConfig, Selection, Shard
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import CellOptions, Summary, run
 from sb3_saf.experiments.tables import requested
@@ -55,7 +55,7 @@ def run_inline(
 ) -> tuple[Summary, InlineEngine]:
     engine = engine or InlineEngine()
     options = CellOptions(retries=retries)
-    return run(find_experiment(name), selection, config, Results(folder), engine, options, shard), engine
+    return run(EXPERIMENTS[name], selection, config, Results(folder), engine, options, shard), engine
 
 
 @pytest.fixture(scope="module")
@@ -311,7 +311,7 @@ def test_changed_files_of_zoo_configs_are_refused(undisturbed: Path, tmp_path: P
 
 def test_a_changed_test_is_not_taken_for_good_by_a_further_one(undisturbed: Path, tmp_path: Path) -> None:
     results = Results(shutil.copytree(undisturbed, tmp_path / "copy"))
-    cell = next(cell for cell in requested(find_experiment("joint"), results) if cell.id == CELL)
+    cell = next(cell for cell in requested(EXPERIMENTS["joint"], results) if cell.id == CELL)
     (test,) = (results.cell_folder(cell) / "tests").iterdir()
     test.write_text(test.read_text() + " ")
     (results.unfinished(cell) / "result" / "tests").mkdir(parents=True)

@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 
 import hecogrid_envs
-from sb3_saf.experiments.definitions import Selection, find_experiment
+from sb3_saf.experiments.definitions import Selection
+from sb3_saf.experiments.results import Results
 from sb3_saf.training.settings import ALGOS, load_settings
 from sb3_saf.training.yaml_files import SIZES
 
@@ -160,6 +161,6 @@ def test_names_with_paths_are_unknown(name: str) -> None:
     assert refused(lambda: load_settings(name, ENV_IDS[0], "smoke"))
     assert refused(lambda: load_settings("saf", name, "smoke"))
     assert refused(lambda: load_settings("saf", ENV_IDS[0], name))  # type: ignore[arg-type]
-    assert refused(lambda: find_experiment(name))
+    assert refused(lambda: Results(Path("nowhere")).experiment(name))
     assert refused(lambda: Selection((0,), (name,)))
     assert refused(lambda: hecogrid_envs.parallel_env(name))

@@ -13,7 +13,7 @@ import pytest
 
 from sb3_saf import ExportError, evaluate_team, load_team, load_weights, save_weights
 from sb3_saf.experiments import cli
-from sb3_saf.experiments.definitions import RunConfig, Selection, find_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
 from sb3_saf.suites.registry import suites
@@ -51,7 +51,7 @@ def experiments(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of experiments with all methods, of ``ippo`` two seeds, read-only."""
     folder = tmp_path_factory.mktemp("experiments")
     for seeds, methods in (((0,), METHODS), ((1,), ("ippo",))):
-        run(find_experiment("joint"), Selection(seeds, methods, (), ("2",)), SMOKE, Results(folder), InlineEngine())
+        run(EXPERIMENTS["joint"], Selection(seeds, methods, (), ("2",)), SMOKE, Results(folder), InlineEngine())
     return folder
 
 

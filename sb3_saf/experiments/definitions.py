@@ -291,14 +291,6 @@ _ALL: Final = (
 )
 EXPERIMENTS: Final[dict[str, Experiment]] = {experiment.name: experiment for experiment in _ALL}
 
-
-def find_experiment(name: str, others: Collection[str] = ()) -> Experiment:
-    """Return an experiment of the paper; the ValueError suggests the nearest known name."""
-    if name not in EXPERIMENTS:
-        raise unknown_name("experiment", name, [*others, *EXPERIMENTS])
-    return EXPERIMENTS[name]
-
-
 #: Algorithm whose settings define the environment of the random team; it is the same for all algorithms.
 _ANY_ALGORITHM = "ippo"
 #: Settings of the games, which a random team plays, too.

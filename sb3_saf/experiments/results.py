@@ -28,9 +28,9 @@ from sb3_saf.experiments.definitions import (
     Level,
     RunConfig,
     Selection,
-    find_experiment,
     own_experiment,
 )
+from sb3_saf.teams.checks import unknown_name
 from sb3_saf.teams.files import differences, plain, read_json, try_lock, write_json, write_text
 from sb3_saf.training.folders import CURVE, RUN_FILE, Run, finish_run
 
@@ -282,7 +282,7 @@ class Results:
         if stored is not None:
             return own_experiment(name, stored.envs, stored.vary)
         own = [path.parent.name for folder in ("", "../*/") for path in self.folder.glob(f"{folder}*/experiment.json")]
-        return find_experiment(name, own)
+        raise unknown_name("experiment", name, [*own, *EXPERIMENTS])
 
 
 def _own(experiment: Experiment) -> dict[str, Any]:
