@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -239,17 +240,14 @@ def _compare(cell: Cell, before: Path, after: Path) -> Iterator[tuple[str, str]]
         yield what, "" if curves[0] == curves[1] else "differs"
     for what, name in (("best weights", BEST_MODEL), ("weights", MODEL)):
         try:
-            old, new = (
-                {
-                    key: (tensor.dtype, tuple(tensor.shape), tensor.numpy().tobytes())
-                    for key, tensor in read_weights(path).items()
-                }
-                for path in (before / name, after / name)
-            )
+            yield what, differences(_described(before / name), _described(after / name))
         except ValueError as error:
             yield what, str(error)
-            continue
-        changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-        forms = [[" of shape ".join(map(str, one.get(key, "?")[:2])) for one in (old, new)] for key in changed[:1]]
-        such = " ".join(f"is {before}, now {after}" for before, after in forms if before != after)
-        yield what, f"{len(changed)} of {len(old)} tensors differ, such as {changed[0]} {such}" if changed else ""
+
+
+def _described(path: Path) -> dict[str, str]:
+    """Return form and digest of each tensor of a model's file."""
+    return {
+        name: f"{tensor.dtype} of shape {tuple(tensor.shape)}, {sha256(tensor.numpy().tobytes()).hexdigest()[:16]}"
+        for name, tensor in read_weights(path).items()
+    }
