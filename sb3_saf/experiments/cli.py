@@ -40,9 +40,8 @@ from sb3_saf.training.folders import TEAMS, check_team, missing_package, python_
 from sb3_saf.training.yaml_files import SIZES, Size
 
 DEFAULT_SIZE: Final[Size] = "small"
-#: Episodes of tests, game steps between evaluations, their episodes; the size smoke is for trying commands.
-_PROTOCOL: Final = (RunConfig.episodes, RunConfig.eval_freq, RunConfig.eval_episodes)
-_SMOKE: Final = (16, 200, 2)
+#: The protocol of the size smoke, which is for trying commands.
+_SMOKE: Final = {"episodes": 16, "eval_freq": 200, "eval_episodes": 2}
 #: Exit code of a process ended by Ctrl-C.
 _INTERRUPTED: Final = 128 + signal.SIGINT
 
@@ -214,14 +213,8 @@ def _config(options: argparse.Namespace, experiment: Experiment) -> RunConfig:
         if name in varied:
             raise ValueError(f"{name} is what the experiment varies; leave it out of --env-kwargs")
     size = _size(options)
-    episodes, eval_freq, eval_episodes = _SMOKE if size == "smoke" else _PROTOCOL
-    return RunConfig(
-        size,
-        overrides,
-        options.episodes or episodes,
-        options.eval_freq or eval_freq,
-        options.eval_episodes or eval_episodes,
-    )
+    given = {name: getattr(options, name) for name in _SMOKE if getattr(options, name) is not None}
+    return RunConfig(size, overrides, **((_SMOKE if size == "smoke" else {}) | given))
 
 
 def _engine(options: argparse.Namespace) -> Engine:
