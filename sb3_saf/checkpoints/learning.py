@@ -162,19 +162,9 @@ class CheckpointFolder:
             self._lock = None
 
 
-class Run(NamedTuple):
-    """
-    Run of a model.
-
-    :param name: stored in every checkpoint, so that no other run continues in the folder
-    :param description: of model, games and callbacks at the first start
-    """
-
-    name: str
-    description: dict[str, Tree]
-
-
-_RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, Run] = weakref.WeakKeyDictionary()
+#: Of each model in training, what all checkpoints of its run have in common: ``run``, a name, so that no other run
+#: continues in the folder, and ``description``, of model, games and callbacks at the first start.
+_RUNS: weakref.WeakKeyDictionary[BaseAlgorithm, dict[str, Tree]] = weakref.WeakKeyDictionary()
 
 
 class TeamCheckpointCallback(BaseCallback):
@@ -217,7 +207,6 @@ class TeamCheckpointCallback(BaseCallback):
         self.store = CheckpointFolder(folder, check_count("keep", keep))
         self.others = list(all_callbacks(others))
         self.exact = exact
-        self._run = Run("", {})
         self._between_rollouts = False
         self._last: tuple[int, bytes] | None = None
         self._written: int | None = None
@@ -231,10 +220,9 @@ class TeamCheckpointCallback(BaseCallback):
         show_game_steps(self.model)
         self.store.acquire()
         if self.model not in _RUNS:
-            _RUNS[self.model] = Run(uuid.uuid4().hex, description(self.model, self.others))
-        self._run = _RUNS[self.model]
+            _RUNS[self.model] = {"run": uuid.uuid4().hex, "description": description(self.model, self.others)}
         newest = self.store.newest()
-        if newest is not None and newest.tree["run"] != self._run.name:
+        if newest is not None and newest.tree["run"] != _RUNS[self.model]["run"]:
             self.store.release()
             raise CheckpointError(
                 f"{self.store.path} has checkpoints of another run ({newest.path.name}): go on with it by "
@@ -298,10 +286,9 @@ class TeamCheckpointCallback(BaseCallback):
 
     def _state(self) -> dict[str, Tree]:
         return {
-            "run": self._run.name,
+            **_RUNS[self.model],
             "game_steps": team_steps(self.model),
             "software": software(self.model),
-            "description": self._run.description,
             "model": model_state(self.model),
             "environment": environment_state(self.training_env, bool(self.exact)),
             "callbacks": callback_states(self.others, bool(self.exact)),
@@ -394,7 +381,7 @@ def resume(
         load_callback_states(others, tree["callbacks"])
         load_environment_state(env, tree["environment"])
         continue_logs(model, tree["logger"])
-        _RUNS[model] = Run(tree["run"], tree["description"])
+        _RUNS[model] = {name: tree[name] for name in ("run", "description")}
         load_generator_states(tree["generators"], model)  # last: the calls above may draw from them
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
