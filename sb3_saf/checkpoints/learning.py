@@ -455,7 +455,6 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
     :param at_rollout: whether the first signal stops it only at the start of the next rollout, where its state can be
         copied; a second one always stops it now
     """
-    waits = at_rollout
 
     def stop(number: int) -> NoReturn:
         if number == signal.SIGINT:
@@ -463,10 +462,8 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
         raise SystemExit(128 + number)
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal waits
-        if not waits:
+        if not at_rollout or checkpoints._stop is not None:
             stop(number)
-        waits = False
         checkpoints.stop_soon(partial(stop, number))
 
     def newest() -> Path | None:
