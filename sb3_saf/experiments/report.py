@@ -446,9 +446,11 @@ def _comparisons(table: pd.DataFrame, view: View) -> str:
 def _reproduction(content: Content) -> str:
     folder = content.results.folder
     experiment = content.results.experiment(content.experiment.name)  # with all levels
+    grid = ["--env", *experiment.envs, *option_words("--vary", experiment.vary)]
+    own = [] if experiment.name in EXPERIMENTS else grid
     lines = ["## Run it again", "", "```sh"]
     for selection in content.results.selections(experiment.name):
-        words = [*PROGRAM.split(), "run", *experiment_words(experiment), *content.config.words()]
+        words = [*PROGRAM.split(), "run", experiment.name, *own, *content.config.words()]
         words += ["--episodes", str(content.config.episodes), "--seeds", *map(str, selection.seeds)]
         for option, values in (("methods", selection.methods), ("levels", selection.levels)):
             words += [f"--{option}", *values] if values else []
@@ -463,13 +465,6 @@ def _reproduction(content: Content) -> str:
     texts = [run.description["command"] for run in runs]
     lines += ["", "<details><summary>Commands</summary>", "", "```sh", *texts, "```", "", "</details>"]
     return "\n".join([*lines, "", _versions(content)])
-
-
-def experiment_words(experiment: Experiment) -> list[str]:
-    """Return the command line words for an experiment."""
-    if experiment.name in EXPERIMENTS:
-        return [experiment.name]
-    return [experiment.name, "--env", *experiment.envs, *option_words("--vary", experiment.vary)]
 
 
 def _versions(content: Content) -> str:
