@@ -11,7 +11,7 @@ from typing import Any, Final
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_saf.inspection.replay import replay
-from sb3_saf.teams.checks import ExportError, check_seed, evaluation_seed
+from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -58,7 +58,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
     """Write the page and return its path."""
     options = make_parser().parse_args(arguments)
     import_packages(options.gym_packages)
-    with user_errors(ValueError, OSError, ExportError):
+    with user_errors():
         seed = evaluation_seed(check_seed(options.seed))
         models = list(dict.fromkeys(options.model))
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
