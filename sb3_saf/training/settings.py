@@ -498,8 +498,6 @@ def _init_hints(owner: type, without: set[str]) -> dict[str, Any]:
 #: Settings of ``sb3_saf.train --size small`` that also apply to scripts.
 _OF_BUFFER: Final = ("rollout_buffer_class", "rollout_buffer_kwargs")
 _TAKEN: Final = ("learning_rate", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", *_OF_BUFFER)
-#: The same for HECOGrid's games only.
-_TAKEN_OF_HECOGRID: Final = (*_TAKEN, "gamma")
 
 
 def ppo_settings(
@@ -541,7 +539,8 @@ def ppo_settings(
     n_games, own = env.num_envs // n_agents, TeamSpaces.from_observation_space(env.observation_space).own
     encoder = LightEncoder if hasattr(own, "atlas") else None
     source = entry_of(read_settings(spec.config), ("default",) if encoder is None else ("default", HOME), "small")
-    hints, taken = algorithm_arguments(algorithm), _TAKEN if encoder is None else _TAKEN_OF_HECOGRID
+    hints = algorithm_arguments(algorithm)
+    taken = _TAKEN if encoder is None else (*_TAKEN, "gamma")  # HECOGrid's discount
     policy: Any = algorithm.policy_aliases[spec.policy]
     found = {key: convert(key, source[key], hints[key]) for key in taken if key in source and key in hints}
     if not policy.takes_team_buffer:  # masks and sequences need buffers of their own
