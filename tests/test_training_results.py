@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shlex
@@ -109,6 +110,10 @@ def test_gif_mp4_and_text_show_every_step_of_the_first_game(
     games.seed(evaluation_seed(9, test=0))
     games.reset()
     assert pages.startswith(games.env_method("render", indices=[0])[0])
+    with zoo_enjoy.open_screen(argparse.Namespace(no_render=False, text=True), games) as show:
+        assert show is not None
+        with pytest.raises(ValueError, match=r"expected text from render.* got ndarray; leave out --text"):
+            show(np.zeros((4, 4, 3), np.uint8))
 
 
 def test_a_window_needs_a_display(

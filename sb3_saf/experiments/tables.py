@@ -41,6 +41,7 @@ import hashlib
 import json
 import math
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from fnmatch import fnmatchcase
@@ -122,6 +123,13 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
     rows, known = (tests.fillna({"max_return": -1}) for tests in (theirs.tests, here))
     same_games = keys_of(rows, *games).isin(keys_of(known, *games))
     rows = theirs.tests[same_games & rows["game_steps"].isin({0, *here["game_steps"]})]
+    if rows.empty:
+        steps = ", ".join(f"{n:,}" for n in sorted(set(here["game_steps"]) - {0}))
+        warnings.warn(
+            "published results are of other games (task, level, agents, parameters) or of trainings that are not of "
+            f"{steps} game steps: none is beside",
+            stacklevel=2,
+        )
     protocol = "method", "training", "episodes", "actions"
     rows = rows.assign(**{name: rows.get(name, "not told") for name in protocol})
     differs = rows["method"].isin(here["method"]) & (rows["method"] != RANDOM)

@@ -214,8 +214,12 @@ def write_video(path: Path, frames: Sequence[Frame], fps: int = FPS) -> None:
 
 def _print_in_place(frame: Frame) -> None:
     """Print a game: in place on a terminal, else one page after the other."""
+    if not isinstance(frame, str):
+        raise ValueError(
+            f"expected text from render() with render_mode='ansi', got {type(frame).__name__}; leave out --text"
+        )
     on_terminal = sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb"
-    print(("\x1b[2J\x1b[H" if on_terminal else "") + str(frame), end="\n\n", flush=True)
+    print(("\x1b[2J\x1b[H" if on_terminal else "") + frame, end="\n\n", flush=True)
     if on_terminal:
         time.sleep(1 / FPS)
 
