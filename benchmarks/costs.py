@@ -11,8 +11,6 @@ Processor time of one core; programs take turns, and the table shows medians.
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -21,6 +19,7 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
+from benchmarks.turns import Work, rates
 from sb3_saf import LightEncoder, MLPEncoder, NatureEncoder, PaperCNN, TeamRolloutBuffer, make_team_env
 
 N_VIEWS: Final = 128
@@ -29,13 +28,12 @@ OF_METHODS: Final = (PaperCNN, LightEncoder, MLPEncoder)
 #: Height and width of images, and their encoder.
 PICTURES: Final[dict[tuple[int, int], tuple[type[BaseFeaturesExtractor], ...]]] = {
     (28, 28): (PaperCNN, LightEncoder),
-    (64, 64): (PaperCNN, NatureEncoder, LightEncoder),
     (84, 84): (PaperCNN, NatureEncoder, LightEncoder),
     (280, 480): (NatureEncoder,),
 }
 
 
-def encoder_work(encoder_class: type[BaseFeaturesExtractor], height: int, width: int) -> tuple[Callable[[], int], int]:
+def encoder_work(encoder_class: type[BaseFeaturesExtractor], height: int, width: int) -> tuple[Work, int]:
     """Run forward and backward over some views; also return the number of weights."""
     encoder = encoder_class(spaces.Box(0, 255, (3, height, width), np.uint8))
     pictures = th.rand(N_VIEWS if height < 100 else 16, 3, height, width)
@@ -47,7 +45,7 @@ def encoder_work(encoder_class: type[BaseFeaturesExtractor], height: int, width:
     return work, sum(parameter.numel() for parameter in encoder.parameters())
 
 
-def method_work(method: str, encoder: type[BaseFeaturesExtractor], n_games: int) -> Callable[[], int]:
+def method_work(method: str, encoder: type[BaseFeaturesExtractor], n_games: int) -> Work:
     """Run one rollout of 25 steps and 4 epochs over it."""
     env = make_team_env("TeamSupport", n_envs=n_games, seed=0)
     n_rows = 25 * env.num_envs
@@ -62,29 +60,16 @@ def method_work(method: str, encoder: type[BaseFeaturesExtractor], n_games: int)
     return work
 
 
-def medians(programs: dict[Any, Callable[[], int]], rounds: int) -> dict[Any, float]:
-    """Return each program's units per second of processor time; the first round is a warm-up."""
-    rates: dict[Any, list[float]] = {name: [] for name in programs}
-    for _ in range(rounds + 1):
-        for name, work in programs.items():
-            start = time.process_time()
-            count = work()
-            rates[name].append(count / (time.process_time() - start))
-    return {name: float(np.median(values[1:])) for name, values in rates.items()}
-
-
 def encoder_table(rounds: int) -> None:
     """Print the costs of encoders."""
     made = {
         (size, encoder): encoder_work(encoder, *size) for size, encoders in PICTURES.items() for encoder in encoders
     }
-    rates = medians({key: work for key, (work, _) in made.items()}, rounds)
+    measured = rates({key: work for key, (work, _) in made.items()}, rounds)
     print("| pixels | encoder | weights | views/s, forward and backward |\n| --- | --- | --- | --- |")
     for (size, encoder), (_, n_weights) in made.items():
-        print(
-            f"| {size[0]} x {size[1]} x 3 | `{encoder.__name__}` | {n_weights:,} | {rates[(size, encoder)]:,.0f} |",
-            flush=True,
-        )
+        rate = np.median(measured[size, encoder])
+        print(f"| {size[0]} x {size[1]} x 3 | `{encoder.__name__}` | {n_weights:,} | {rate:,.0f} |", flush=True)
 
 
 def method_table(rounds: int, n_games: int) -> None:
@@ -92,13 +77,13 @@ def method_table(rounds: int, n_games: int) -> None:
     programs = {
         (method, encoder): method_work(method, encoder, n_games) for method in METHODS for encoder in OF_METHODS
     }
-    rates = medians(programs, rounds)
+    medians = {key: np.median(values) for key, values in rates(programs, rounds).items()}
     print("| agent-steps/s | " + " | ".join(f"`{encoder.__name__}`" for encoder in OF_METHODS) + " |")
     print("| --- |" + " --- |" * len(OF_METHODS))
     for method in METHODS:
-        cells = [f"{rates[(method, encoder)]:,.0f}" for encoder in OF_METHODS]
+        cells = [f"{medians[method, encoder]:,.0f}" for encoder in OF_METHODS]
         print(f"| {method} | " + " | ".join(cells) + " |")
-    ratios = [f"{rates[('MAPPO', encoder)] / rates[('SAF', encoder)]:.1f}" for encoder in OF_METHODS]
+    ratios = [f"{medians['MAPPO', encoder] / medians['SAF', encoder]:.1f}" for encoder in OF_METHODS]
     print("| SAF takes x times MAPPO's time | " + " | ".join(ratios) + " |")
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -20,11 +19,9 @@ from typing import Any, Final
 import numpy as np
 
 import sb3_saf
+from benchmarks.turns import Work, rates
 from hecogrid_envs import TASK_NAMES, GameBatch, HECOGridParams, parallel_env
 from sb3_saf.training.folders import software_versions
-
-#: Does some work and returns the number of agent-steps.
-Work = Callable[[], int]
 
 N_GAMES: Final = 128
 N_AGENTS: Final = 10
@@ -224,43 +221,22 @@ def programs() -> dict[str, Callable[[], Work]]:
     }
 
 
-def rate(work: Work, seconds: float) -> float:
-    """
-    Work for a while.
-
-    :param seconds: minimum
-    :return: agent-steps per second
-    """
-    start, n_done = time.perf_counter(), 0
-    while time.perf_counter() - start < seconds:
-        n_done += work()
-    return n_done / (time.perf_counter() - start)
-
-
-def measure(titles: dict[str, Callable[[], Work]], seconds: float, rounds: int) -> dict[str, list[float]]:
-    """
-    Measure every program once per round, after a round of warm-up; a message names programs that cannot run.
-
-    :param titles: programs by title
-    :param seconds: per program and round
-    :param rounds: that count
-    :return: agent-steps per second of every round, by title
-    """
+def made() -> dict[str, Work]:
+    """Make all programs; a message names those that cannot run."""
     works = {}
-    for title, make in titles.items():
+    for title, make in programs().items():
         try:
             works[title] = make()
         except Exception as error:  # raised by third-party libraries
             print(f"left out: {title} ({type(error).__name__}: {str(error).splitlines()[0][:200]})", flush=True)
-    measured = [{title: rate(work, seconds) for title, work in works.items()} for _ in range(rounds + 1)]
-    return {title: [rates[title] for rates in measured[1:]] for title in works}
+    return works
 
 
-def table(rates: dict[str, list[float]]) -> str:
+def table(measured: dict[str, list[float]]) -> str:
     """Format rates as Markdown: median, spread, and the ratio to the copy."""
-    copy = float(np.median(rates[COPY]))
+    copy = float(np.median(measured[COPY]))
     lines = ["| what | agent-steps/s | lowest - highest | ratio to the copy |", "| --- | --- | --- | --- |"]
-    for title, values in rates.items():
+    for title, values in measured.items():
         median = float(np.median(values))
         lines.append(f"| {title} | {median:,.0f} | {min(values):,.0f} - {max(values):,.0f} | {median / copy:.3g} |")
     return "\n".join(lines)
@@ -275,7 +251,7 @@ def main() -> None:
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # one core, before JAX starts its threads
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    text = table(measure(programs(), options.seconds, options.rounds))
+    text = table(rates(made(), options.rounds, options.seconds))
     print(text)
     versions = software_versions()
     machine = ", ".join(f"{name} {versions[name]}" for name in ("processor", "python", "numba", "numpy", "torch"))

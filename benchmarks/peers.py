@@ -21,7 +21,6 @@ import argparse
 import contextlib
 import csv
 import json
-import math
 import os
 import resource
 import subprocess
@@ -32,10 +31,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
-
-if TYPE_CHECKING:
-    import pandas as pd
+from typing import Any, Final, NamedTuple
 
 FILE: Final = Path("results", "suites_baselines.csv")
 COLUMNS: Final = ("task", "program", "seed", "game_steps", "return", "won", "processor_seconds", "source")
@@ -324,43 +320,25 @@ def _trained(peer: Peer, seed: int, clones: Mapping[str, Path | None], interpret
 
 
 def print_trainings(clones: Mapping[str, Path | None], interpreters: Mapping[str, str]) -> None:
-    """
-    Print return and processor seconds of whole trainings, seed 0, and when ours first had the return of the others.
-
-    Ours are tested on 32 games with drawn actions; the time until a return is that of the training episodes.
-    """
+    """Print return and processor seconds of whole trainings, seed 0; MAPPO is tested on 32 games with drawn actions."""
     suite_results = import_module("benchmarks.suite_results")
-    print("\n| task | program | game steps | return | processor s | until the first one's return |")
-    print("|" + " --- |" * 6)
+    print("\n| task | program | game steps | return | processor s |\n|" + " --- |" * 5)
     for peer in RATED:
         row = _trained(peer, 0, clones, interpreters) if clones[peer.kind] is not None else []
         if row:
             _print_row(peer.task, peer.program, row[3], row[4], row[6])
-        task = suite_results.Task(peer.task, peer.game_steps, ("mappo", "ippo", "saf"))
+        task = suite_results.Task(peer.task, peer.game_steps, ("mappo",))
         with tempfile.TemporaryDirectory() as folder:
             options = argparse.Namespace(folder=Path(folder))
             with contextlib.redirect_stdout(sys.stderr):
                 suite_results.run(task, 0, options)
-            results = suite_results.read_results(Path(folder, task.name), task.name)
-        for method, tests in results.tests[results.tests["method"] != "random"].groupby("method"):
-            curve = results.curves[results.curves["method"] == method]
-            until = _seconds_until(curve, float(row[4])) if row else math.nan
-            test = tests.iloc[0]
-            _print_row(
-                peer.task, method.upper(), test["game_steps"], test["return_mean"], test["processor_seconds"], until
-            )
+            tests = suite_results.read_results(Path(folder, task.name), task.name).tests
+        (test,) = tests[tests["method"] == "mappo"].to_dict("records")
+        _print_row(peer.task, "MAPPO", test["game_steps"], test["return_mean"], test["processor_seconds"])
 
 
-def _seconds_until(curve: pd.DataFrame, value: float) -> float:
-    """Return the processor seconds after which the mean of five points of a curve first reached a value."""
-    curve = curve.sort_values("game_steps")
-    there = curve["processor_seconds"][curve["score"].rolling(5).mean() >= value]
-    return math.inf if there.empty else float(there.iloc[0])
-
-
-def _print_row(task: str, program: str, game_steps: int, value: float, seconds: float, until: float = math.nan) -> None:
-    cells = (f"{game_steps:,}", f"{value:.2f}", f"{seconds:.0f}", "" if math.isnan(until) else f"{until:.0f} s")
-    print(f"| {task} | {program} | {' | '.join(cells)} |", flush=True)
+def _print_row(task: str, program: str, game_steps: int, value: float, seconds: float) -> None:
+    print(f"| {task} | {program} | {game_steps:,} | {value:.2f} | {seconds:.0f} |", flush=True)
 
 
 def _key(row: Sequence[object]) -> tuple[str, ...]:
