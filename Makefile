@@ -15,7 +15,6 @@ INSTALL = $(VENV)/bin/python -W ignore::UserWarning -m pip install --quiet --dis
 # What training needs, and everything: linters, Sphinx, Ray, notebooks, ...
 TRAINING = $(VENV)/.training
 INSTALLED = $(VENV)/.installed
-GRIDWORLDS = $(VENV)/.gridworlds
 
 # Many processes are started: they keep compiled modules, whatever the environment says, and pip leaves compiling to them,
 # since all of torch takes longer than the rest of the installation.
@@ -40,7 +39,7 @@ check: $(INSTALLED) ## what CI runs: format, lint, types, documentation, noteboo
 coverage: $(INSTALLED) ## run the tests and print their branch coverage
 	@$(RUN) pytest -n $(JOBS) --dist loadscope --cov sb3_saf --cov hecogrid_envs --cov-branch --cov-report term:skip-covered $(PYTEST_ARGS)
 
-bench: $(GRIDWORLDS) ## measure speed beside other gridworlds; writes benchmarks/results.md
+bench: $(INSTALLED) ## measure speed beside another gridworld; writes benchmarks/results.md
 	@$(RUN) benchmarks.environments
 
 docs: $(INSTALLED) ## build the documentation into build/docs/html, warnings as errors
@@ -89,13 +88,6 @@ $(TRAINING): setup.cfg pyproject.toml constraints.txt
 $(INSTALLED): $(TRAINING)
 	@echo "== install the rest into $(VENV): tests, types, documentation, notebooks, Ray, games of others"
 	@$(INSTALL) --editable '.[dev,docs,export,lbf,mpe,notebooks,ray,render,rware,sisl,zoo]'
-	@touch $@
-
-# What cannot be installed is left out of the benchmarks, which say so.
-$(GRIDWORLDS): $(INSTALLED)
-	@echo "== install other gridworlds into $(VENV)"
-	@$(INSTALL) --editable '.[bench]' || \
-	    echo "The extra [bench] could not be installed." >&2
 	@touch $@
 
 clean: ## remove caches and what was built
