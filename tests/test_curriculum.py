@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf
@@ -134,20 +132,6 @@ def test_the_last_stage_plays_the_games_of_an_environment_of_that_level() -> Non
     for ours, theirs in zip(_play(staged, 60), _play(plain, 60), strict=True):
         np.testing.assert_array_equal(ours.obs["obs"], theirs.obs["obs"])
         np.testing.assert_array_equal(ours.rewards, theirs.rewards)
-
-
-def test_a_run_that_is_resumed_in_a_later_stage_equals_an_undisturbed_one(tmp_path: Path) -> None:
-    def model(folder: str) -> PPO:
-        env = _staged(monitor_dir=str(tmp_path / folder))
-        return PPO("MAPPOPolicy", env, n_steps=5, batch_size=30, rollout_buffer_class=sb3_saf.TeamRolloutBuffer, seed=0)
-
-    whole = sb3_saf.resumable_learn(model("whole"), 180, tmp_path / "whole/ck")
-    sb3_saf.resumable_learn(model("cut"), 90, tmp_path / "cut/ck")  # 30 game steps: in the second stage
-    resumed = sb3_saf.resumable_learn(model("cut"), 180, tmp_path / "cut/ck")
-    for name, weights in whole.policy.state_dict().items():
-        np.testing.assert_array_equal(weights, resumed.policy.state_dict()[name])
-    files = [(tmp_path / folder / "monitor.csv").read_text().splitlines()[2:] for folder in ("whole", "cut")]
-    assert [line.rsplit(",", 1)[0] for line in files[0]] == [line.rsplit(",", 1)[0] for line in files[1]]
 
 
 def test_any_environment_has_stages() -> None:

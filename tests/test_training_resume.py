@@ -45,16 +45,16 @@ def struck(folder: Path, algo: str, *options: str, error: type[BaseException] = 
 
 
 @pytest.mark.parametrize(
-    ("algo", "more"),
-    [("saf", ("-params", "callback:sb3_saf.EntropySchedule")), ("qplex", ("--inspect-freq", "100000"))],
+    ("algo", "strikes", "more"),
+    [("saf", (1, 2), ("-params", "callback:sb3_saf.EntropySchedule")), ("qplex", (2,), ("--inspect-freq", "100000"))],
 )
-def test_a_run_that_was_struck_twice_ends_as_the_undisturbed_one(
-    algo: str, more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_run_that_was_struck_ends_as_the_undisturbed_one(
+    algo: str, strikes: tuple[int, ...], more: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ("--resume", *more)
     train(tmp_path / "undisturbed", algo, "--seed", "3", *options)
     assert "unfinished: a new one begins" in capsys.readouterr().out
-    for evaluation in (1, 2):
+    for evaluation in strikes:
         struck(tmp_path / "run", algo, *options, at=evaluation)
     (tmp_path / "run" / algo / f"{ENV}_1" / ".writing-0-best_model.zip").touch()  # as left by SIGKILL
     train(tmp_path / "run", algo, *options, "--checkpoint-freq", "-1")  # writes no more; the seed is the run's
