@@ -20,7 +20,7 @@ import pytest
 
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, run_job
-from sb3_saf.experiments.definitions import EXPERIMENTS, Cell, RunConfig, Selection
+from sb3_saf.experiments.definitions import Cell, RunConfig, Selection, find_experiment
 from sb3_saf.experiments.engines import RayEngine, _run_on_ray, inputs_of, require_ray
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
@@ -168,15 +168,10 @@ def test_ray_on_this_machine_listens_on_localhost_only_and_knows_its_size() -> N
 def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint_and_a_job_that_is_none_fails(
     cluster: Any, tmp_path: Path
 ) -> None:
-    experiment = EXPERIMENTS["joint"]
-    (level, *_) = experiment.tests()
-    job = Job(
-        Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 1_000}, 32, 500, 2)
-    )
     whole, killed = (tmp_path / name for name in ("whole", "killed"))
     for folder in (whole, killed):
         folder.mkdir()
-        job.write(folder)
+        ippo(1_000, 500).write(folder)
     run_job(whole)
     with RayEngine(cluster.address) as engine:
         first = engine.submit(killed)
@@ -199,24 +194,35 @@ def test_a_cell_whose_worker_is_killed_goes_on_from_its_checkpoint_and_a_job_tha
     assert_same_weights(whole / "result" / "model.zip", killed / "result" / "model.zip")
 
 
-@pytest.mark.parametrize(("is_shared", "is_trained"), [(True, False), (False, False), (False, True)])
-def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, is_trained: bool, tmp_path: Path) -> None:
-    """On such a node, killed cells resume; to and from other nodes, trained models and results are sent."""
+def ippo(game_steps: int, eval_freq: int) -> Job:
     experiment = EXPERIMENTS["joint"]
     (level, *_) = experiment.tests()
-    job = Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), RunConfig("smoke", {"game_steps": 40}, 32, 40, 2))
-    for name in ("here", "there"):
-        (tmp_path / name).mkdir()
-        job.write(tmp_path / name)
-    run_job(tmp_path / "here")
+    config = RunConfig("smoke", {"game_steps": game_steps}, 32, eval_freq, 2)
+    return Job(Cell("ippo", experiment.envs[0], level, 0, (level,)), config)
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a job that was done on this machine."""
+    folder = tmp_path_factory.mktemp("here")
+    ippo(40, 40).write(folder)
+    run_job(folder)
+    return folder
+
+
+@pytest.mark.parametrize(("is_shared", "is_trained"), [(True, False), (False, False), (False, True)])
+def test_a_node_works_in_the_folder_that_it_sees(is_shared: bool, is_trained: bool, here: Path, tmp_path: Path) -> None:
+    """On such a node, killed cells resume; to and from other nodes, trained models and results are sent."""
     folder = tmp_path / "there"
-    for model in (tmp_path / "here" / "result").glob("*.zip") if is_trained else ():
+    folder.mkdir()
+    ippo(40, 40).write(folder)
+    for model in (here / "result").glob("*.zip") if is_trained else ():
         shutil.copy(model, folder)
     archive = _run_on_ray(str(folder if is_shared else tmp_path / "x"), inputs_of(folder))
     assert (archive is None) == is_shared
     if archive is not None:
         zipfile.ZipFile(io.BytesIO(archive)).extractall(folder / "result")
-    ours, theirs = ((tmp_path / name / "result" / "tests/c2-h2.json").read_text() for name in ("here", "there"))
+    ours, theirs = ((of / "result" / "tests/c2-h2.json").read_text() for of in (here, folder))
     assert ours.partition('"wall')[0] == theirs.partition('"wall')[0]
     assert (folder / "result" / "run.json").exists() != is_trained
 

@@ -37,7 +37,7 @@ from tests.experiments_jobs import InlineEngine, read_table
 #: Two large updates, and teams after them: seeds play differently.
 OVERRIDES = {"game_steps": 80, "learning_rate": 0.01}
 SMOKE = RunConfig("smoke", OVERRIDES, episodes=TEST_GAMES + 8, eval_freq=80, eval_episodes=2)
-METHODS = ("saf", "mappo", "ippo", "ippo-separate", "saf-gru", "qplex")
+METHODS = ("saf", "ippo", "ippo-separate", "saf-gru", "qplex")
 LEVEL = "TeamSupport-c2-h2"
 NAMES = sorted(f"{LEVEL}/{method}" for method in METHODS)
 #: All teams of the repository may take no more.
@@ -144,7 +144,7 @@ def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture
     content = bytearray(path.read_bytes())
     content[-7] ^= 1
     path.write_bytes(content)
-    description = teams / LEVEL / "mappo" / "run.json"
+    description = teams / LEVEL / "ippo" / "run.json"
     description.write_text(description.read_text() + " ")
     assert cli.main(["teams", str(teams)]) == 1
     printed = capsys.readouterr()
@@ -153,7 +153,7 @@ def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture
 
 
 def test_a_team_of_a_suite_that_is_not_installed_is_no_failure(teams: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    name = f"{LEVEL}/mappo"
+    name = f"{LEVEL}/ippo"
     assert missing_package(name, teams) is None
     change(teams, lambda saved: saved.update(env="smax/3m"), name)
     problem = missing_package(name, teams)
