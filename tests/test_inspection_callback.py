@@ -7,7 +7,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -43,6 +43,7 @@ from tests.probe_envs import ConstantReward, DelayedReward, Message
 from tests.team_venv import TeamVenv
 from tests.test_active import ACTIVE, LIVES
 from tests.test_monitor import RETURN_OF_GAME_0, RETURN_OF_GAME_1
+from tests.test_probes import error_of
 from tests.test_probes import train as train_on_probe
 from tests.test_qplex import make_model as make_qplex
 from tests.test_qplex import telling_env
@@ -101,26 +102,38 @@ def groups(tags: Any) -> set[str]:
     return {tag.split("/")[0] for tag in tags} - {"rollout", "time", "train"}
 
 
+class Inspected(NamedTuple):
+    """A model, the callback that inspected it in training, and the folder of its logs."""
+
+    model: Any
+    callback: InspectionCallback
+    folder: Path
+
+
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> EventAccumulator:
+def inspected(tmp_path_factory: pytest.TempPathFactory) -> Inspected:
     """Train SAF on a small HECOGrid, with everything turned on."""
     folder = tmp_path_factory.mktemp("page")
     env = make_team_env("TeamSupport", n_envs=4, seed=0, **LEVEL)
     eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
-    callback = InspectionCallback(eval_env, every_game_steps=20, n_eval_episodes=3, hparams={"task": "TeamSupport"})
-    learn(folder, callback, env=env, n_updates=2)
-    return events(folder)
+    callback = InspectionCallback(eval_env, every_game_steps=24, n_eval_episodes=3, hparams={"task": "TeamSupport"})
+    return Inspected(learn(folder, callback, env=env, n_updates=2), callback, folder)
+
+
+@pytest.fixture(scope="module")
+def page(inspected: Inspected) -> EventAccumulator:
+    return events(inspected.folder)
 
 
 class TestInHand:
-    def test_is_what_the_callback_writes(self, tmp_path: Path) -> None:
-        eval_env = make_team_env("TeamSupport", n_envs=2, render_mode="rgb_array", **LEVEL)
-        model = learn(tmp_path, InspectionCallback(eval_env, n_eval_episodes=3), env=level_games(), n_updates=1)
+    def test_is_what_the_callback_writes(self, inspected: Inspected, page: EventAccumulator) -> None:
+        model, eval_env, found = inspected.model, inspected.callback.eval_env, page
         before = th.get_rng_state()
         look = inspect_team(model, eval_env, n_eval_episodes=3)
         assert th.equal(th.get_rng_state(), before)
-        assert inspect_team(model, eval_env, n_eval_episodes=3).scalars == look.scalars  # the same episodes every time
-        written, found = scalars_of(tmp_path), events(tmp_path)
+        again = inspect_team(model, eval_env, n_eval_episodes=3, pictures=False)
+        assert again.scalars == look.scalars  # the same episodes every time
+        written = scalars_of(inspected.folder)
         shown_as = {tag: line_of(tag) or tag for tag in look.scalars}
         assert {tag: pytest.approx(written[shown_as[tag]][-1], rel=1e-5) for tag in look.scalars} == look.scalars
         assert shown_as["pool/chosen/policy_2"] == Line("pool/chosen", "policy_2")
@@ -155,7 +168,7 @@ class TestPage:
         assert expected <= set(page.Tags()["scalars"])
         assert [event.histogram_value.num for event in page.Histograms("team/return_of_each_episode")] == [3] * 3
         # Before, during and after training, on an axis of game steps as for what SB3 logs: a rollout has 20 game steps.
-        assert [event.step for event in page.Scalars("team/return")] == [0, 20, 40]
+        assert [event.step for event in page.Scalars("team/return")] == [0, 24, 40]
         assert [event.step for event in page.Scalars("time/fps")] == [20, 40]
 
     def test_pictures(self, page: EventAccumulator) -> None:
@@ -189,7 +202,7 @@ class TestPage:
 )
 def test_training_ends_with_the_same_weights_to_the_last_bit(policy: str, settings: dict[str, Any]) -> None:
     alone = learn(None, None, policy, n_updates=3, **settings).policy.state_dict()
-    callback = InspectionCallback(ToyTeams(), every_game_steps=7, n_eval_episodes=2, pictures=False)
+    callback = InspectionCallback(ToyTeams(), every_game_steps=24, n_eval_episodes=2, pictures=False)
     with pytest.warns(UserWarning, match="writes no TensorBoard file"):
         watched = learn(None, callback, policy, n_updates=3, **settings).policy.state_dict()
     assert callback.seconds > 0 and alone.keys() == watched.keys()
@@ -318,7 +331,9 @@ def test_hecogrids_zones_are_those_of_the_agents_columns() -> None:
 class TestMessages:
     def test_a_critic_that_needs_messages_is_wrong_without(self) -> None:
         """The value is what the next agent sees, -1 or 1: every guess without the message has an error of 1 or more."""
-        policy = train_on_probe("SAFPolicy", Message(n_agents=3), n_updates=15)
+        probe = Message(n_agents=3)
+        policy = train_on_probe("SAFPolicy", probe, n_updates=25)
+        assert error_of(policy, probe) < 0.1
         scalars = message_scalars(play(make_team_env(Message(n_agents=3), n_envs=64), policy, 128, gamma=0.9))
         assert scalars["message/value_error"] < 0.3
         assert scalars["message/value_error_zeroed"] > 0.9

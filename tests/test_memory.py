@@ -323,7 +323,7 @@ def test_two_runs_of_one_seed_end_alike_and_evaluation_between_changes_nothing()
 
 
 def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tmp_path: Any) -> None:
-    callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=7, pictures=False)
+    callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=40, pictures=False)
     plain = make_model(env=make_env((5, 5, 5))).learn(48 * 9)
     watched = make_model(env=make_env((5, 5, 5)), tensorboard_log=str(tmp_path)).learn(48 * 9, callback=callback)
     assert weights_of(plain) == weights_of(watched)
@@ -335,19 +335,15 @@ def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tm
 
 
 @pytest.mark.parametrize(
-    ("method", "memory", "n_episodes", "right"),
+    ("method", "memory", "n_episodes"),
     [
-        ("ippo", "lstm", 2_000, True),
-        ("qplex", "gru", 3_000, True),
-        ("mappo", None, 800, False),
+        ("ippo", "lstm", 2_000),
+        ("qplex", "gru", 3_000),
     ],
 )
-def test_a_cue_in_the_first_step_is_answered_in_the_last(
-    method: str, memory: str | None, n_episodes: int, right: bool
-) -> None:
+def test_a_cue_in_the_first_step_is_answered_in_the_last(method: str, memory: str, n_episodes: int) -> None:
     """With masks, and an agent that may have left before; ``python -m benchmarks.memory`` is the whole ladder."""
-    answered = share_right(trained(method, memory, 3, n_episodes=n_episodes), 3)
-    assert answered > 0.95 if right else 0.35 < answered < 0.65
+    assert share_right(trained(method, memory, 3, n_episodes=n_episodes), 3) > 0.95
 
 
 # --- acting -----------------------------------------------------------------------------------------------------------
