@@ -345,22 +345,20 @@ class ReferenceWorld:
         :return: (P, P, 3) with P = view_size * view_tile_size, indexed [pixel row, pixel column, channel]
         """
         t = self.tile
-        picture = np.zeros((self.view * t, self.view * t, 3), dtype=np.uint8)
+        tiles = np.empty((self.view, self.view, t, t, 3), dtype=np.uint8)
         seen = self.visible(agent)
         for i in range(self.view):
             for j in range(self.view):
-                if seen[i, j]:
-                    # Tiles, including keys and grid lines, are drawn with north up and rotate with the map.
-                    tile = np.rot90(self._draw_cell(agent, self.view_cell(agent, i, j)), self.dir[agent] - NORTH)
-                else:
-                    tile = _solid(t, INVISIBLE)
-                picture[j * t : (j + 1) * t, i * t : (i + 1) * t] = tile
-        return picture
+                cell = self.view_cell(agent, i, j)
+                tiles[j, i] = self._draw_cell(agent, cell) if seen[i, j] else _solid(t, INVISIBLE)
+        # Tiles, including keys and grid lines, are drawn with north up and rotate with the map.
+        turned = np.rot90(tiles, self.dir[agent] - NORTH, axes=(2, 3))
+        return turned.swapaxes(1, 2).reshape(self.view * t, self.view * t, 3)
 
     def _draw_cell(self, viewer: int, cell: Cell) -> Image:
         """A visible cell as drawn on a map with north up."""
         if cell in self.walls:
-            return _finish(_solid(self.tile, WALL))
+            return _plain(self.tile, WALL)
         if cell in self.keys:
             return _finish(_key_tile(self.tile))
         agents = self.agents_in(cell)
@@ -369,9 +367,11 @@ class ReferenceWorld:
             drawn = viewer if viewer in agents else agents[0]
             agent_tile = _agent_tile(self.tile, self.dir[drawn], self._colour(drawn))
         if cell in self.treasures:
-            treasure_tile = _solid(self.tile, self._treasure_colour(self.treasures[cell]))
-            return _finish(treasure_tile if agent_tile is None else _blend(treasure_tile, agent_tile))
-        return _finish(_solid(self.tile, BLACK) if agent_tile is None else agent_tile)
+            colour = self._treasure_colour(self.treasures[cell])
+            if agent_tile is None:
+                return _plain(self.tile, colour)
+            return _finish(_blend(_solid(self.tile, colour), agent_tile))
+        return _plain(self.tile, BLACK) if agent_tile is None else _finish(agent_tile)
 
     def _treasure_colour(self, status: int) -> Colour:
         if status == AVAILABLE:
@@ -394,8 +394,14 @@ class ReferenceWorld:
 # ------------------------------------------------------------------------------------------------------ Pixels of tiles
 
 
+@cache
 def _solid(t: int, colour: Colour) -> Image:
     return np.full((t, t, 3), colour, dtype=np.uint8)
+
+
+@cache
+def _plain(t: int, colour: Colour) -> Image:
+    return _finish(_solid(t, colour))
 
 
 def _finish(tile: Image) -> Image:
@@ -405,7 +411,7 @@ def _finish(tile: Image) -> Image:
     corners = [tile[0, 0], tile[0, t - 1], tile[t - 1, 0], tile[t - 1, t - 1]]
     if not any((corner == 0).all() for corner in corners):
         return tile
-    line = _solid(t, BLACK)
+    line = np.zeros_like(tile)
     line[0, :] = grey
     line[:, t - 1] = grey
     return tile + line
