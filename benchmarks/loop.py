@@ -32,6 +32,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from benchmarks.stages import Stopwatch
 from sb3_saf import CentralizedValueWrapper, LightEncoder, TeamMonitor, TeamRolloutBuffer, ppo_settings
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
@@ -197,45 +198,20 @@ def small_model(algo: str, n_agents: int | None = None, n_games: int | None = No
 
 def costs(models: Mapping[str, OnPolicyAlgorithm], rounds: int) -> dict[str, Cost]:
     """Measure programs in turns; the first round is a warm-up."""
-    watches = {name: _Watch(model) for name, model in models.items()}
-    for number in range(rounds + 1):
-        for watch in watches.values():
-            watch.run(counts=number > 0)
-    return {name: watch.cost() for name, watch in watches.items()}
-
-
-class _Watch:
-    """Measures a model's processor time in rollouts and updates."""
-
-    def __init__(self, model: OnPolicyAlgorithm) -> None:
-        self.model = model
-        self._spent: dict[str, float] = {}
-        self._best = {"collect_rollouts": float("inf"), "train": float("inf")}
-        for name in self._best:
-            setattr(model, name, self._timed(name, getattr(model, name)))
-
-    def _timed(self, name: str, inner: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.process_time()
-            result = inner(*args, **kwargs)
-            self._spent[name] = time.process_time() - start
-            return result
-
-        return timed
-
-    @property
-    def _n_rows(self) -> int:
-        return self.model.n_steps * self.model.n_envs
-
-    def run(self, counts: bool) -> None:
-        """Run one rollout and one update."""
-        self.model.learn(self._n_rows, reset_num_timesteps=False)
-        if counts:
-            self._best = {name: min(best, self._spent[name]) for name, best in self._best.items()}
-
-    def cost(self) -> Cost:
-        """Return the best of the rounds."""
-        return Cost(self._best["collect_rollouts"], self._best["train"], self.model.n_steps, self._n_rows)
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
+    for _ in range(rounds + 1):
+        for name, model in models.items():
+            with Stopwatch(clock=time.process_time) as stopwatch:
+                stopwatch.watch(model, "collect_rollouts", "rollout")
+                stopwatch.watch(model, "train", "update")
+                model.learn(model.n_steps * model.n_envs, reset_num_timesteps=False)
+                seconds = stopwatch.stop()
+            spent[name].append((seconds["rollout"], seconds["update"]))
+    found = {}
+    for name, model in models.items():
+        rollouts, updates = zip(*spent[name][1:], strict=True)
+        found[name] = Cost(min(rollouts), min(updates), model.n_steps, model.n_steps * model.n_envs)
+    return found
 
 
 def print_table(title: str, costs_by_name: Mapping[str, Cost]) -> None:

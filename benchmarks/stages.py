@@ -16,9 +16,10 @@ import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
 from typing import Any, Final
+from unittest import mock
 
 import torch as th
 from stable_baselines3 import PPO
@@ -31,30 +32,33 @@ REST: Final = "all else"
 TRANSFER: Final = "arrays to the device"
 
 
-class Stopwatch:
+class Stopwatch(ExitStack):
     """
-    Sums the seconds of nested stages, each without those inside it.
+    Sums the seconds of nested stages, each without those inside it; at its exit no function is watched any more.
 
     :param wait: waits until the device is idle; None if calls are synchronous
+    :param clock: returns seconds
     """
 
-    def __init__(self, wait: Callable[[], None] | None = None) -> None:
+    def __init__(self, wait: Callable[[], None] | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
+        super().__init__()
         self.seconds: dict[str, float] = defaultdict(float)
         self._wait = wait
+        self._clock = clock
         self._stack: list[str] = []
-        self._since = time.perf_counter()
+        self._since = clock()
 
     def _charge(self) -> None:
         if self._wait is not None:
             self._wait()
-        now = time.perf_counter()
+        now = self._clock()
         self.seconds[self._stack[-1] if self._stack else REST] += now - self._since
         self._since = now
 
     def start(self) -> None:
         """Reset all times."""
         self.seconds.clear()
-        self._since = time.perf_counter()
+        self._since = self._clock()
 
     def stop(self) -> dict[str, float]:
         """Return seconds by stage."""
@@ -81,7 +85,7 @@ class Stopwatch:
             with self.stage(name):
                 return inner(*args, **kwargs)
 
-        setattr(owner, method, timed)
+        self.enter_context(mock.patch.object(owner, method, timed))
 
     def watch_items(self, owner: Any, method: str, name: str) -> None:
         """Measure a generator as a stage: the time between its items."""
@@ -96,7 +100,7 @@ class Stopwatch:
                     return
                 yield item
 
-        setattr(owner, method, timed)
+        self.enter_context(mock.patch.object(owner, method, timed))
 
 
 #: Settings by number of games, with minibatches of 2,000 rows: the zoo's own, and rollouts of whole episodes.
@@ -187,27 +191,10 @@ def profile(model: PPO, rollouts: int, wait: bool = True) -> tuple[dict[str, flo
     assert model.env is not None
     rows = model.n_steps * model.env.num_envs
     model.learn(rows)
-    with unpatched():
-        stopwatch = watch(model, wait)
+    with watch(model, wait) as stopwatch:
         stopwatch.start()
         model.learn(rollouts * rows, reset_num_timesteps=False)
         return stopwatch.stop(), rollouts * rows
-
-
-@contextmanager
-def unpatched() -> Iterator[None]:
-    """Restore all wrapped functions that are not the model's own at the end."""
-    owners: list[tuple[Any, str]] = [
-        (th.Tensor, "backward"),
-        (th.nn.utils, "clip_grad_norm_"),
-        (on_policy_algorithm, "obs_as_tensor"),
-    ]
-    before = [getattr(owner, name) for owner, name in owners]
-    try:
-        yield
-    finally:
-        for (owner, name), function in zip(owners, before, strict=True):
-            setattr(owner, name, function)
 
 
 def main() -> None:
