@@ -101,7 +101,7 @@ def test_the_command_writes_its_table(
 ) -> None:
     """Rows for every level and team, printed and in a file; teams that see more collect more."""
     path = tmp_path / "scripted.csv"
-    monkeypatch.setattr(sys, "argv", f"scripted --tasks TeamSupport --coordination 1 --games 4 --csv {path}".split())
+    monkeypatch.setattr(sys, "argv", f"scripted --tasks TeamSupport --coordination 1 --games 2 --csv {path}".split())
     scripted.main()
     rows = pd.read_csv(path)
     assert rows["team"].tolist() == list(TEAMS)

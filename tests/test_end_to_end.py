@@ -18,8 +18,8 @@ def train_as_typed(backend: Any = None) -> PPO:
     """Train as in the README, with fewer epochs and steps, the paper's CNN, and SB3's buffer and batch size."""
     env = sb3_saf.make_team_env("TeamTogether", n_envs=4, seed=0, backend=backend)
     with pytest.warns(UserWarning, match="You have specified a mini-batch size of 64"):
-        model = PPO("SAFPolicy", env, n_steps=25, seed=0, n_epochs=1)
-    return model.learn(1_000)
+        model = PPO("SAFPolicy", env, n_steps=10, seed=0, n_epochs=1)
+    return model.learn(800)
 
 
 def weights(model: Any) -> th.Tensor:
@@ -31,7 +31,7 @@ def test_runs_of_one_seed_end_with_equal_weights_on_both_backends() -> None:
     assert th.equal(weights(first), weights(second))
     assert th.equal(weights(first), weights(supersuit))
     with pytest.warns(UserWarning, match="You have specified a mini-batch size of 64"):
-        untrained = PPO("SAFPolicy", sb3_saf.make_team_env("TeamTogether", n_envs=4), n_steps=50, seed=0)
+        untrained = PPO("SAFPolicy", sb3_saf.make_team_env("TeamTogether", n_envs=4), n_steps=10, seed=0)
     assert not th.equal(weights(first), weights(untrained))
 
 

@@ -103,20 +103,20 @@ def two_threads() -> Iterator[None]:
 
 
 def _trained(algorithm: type[Any], policy: str, memory: str | None = None, **kwargs: Any) -> th.Tensor:
-    env = make_team_env("TeamSupport", n_envs=32, seed=0, n_agents=5, grid_size=12, n_treasures=20)
+    env = make_team_env("TeamSupport", n_envs=16, seed=0, n_agents=5, grid_size=12, n_treasures=20)
     policy_kwargs: dict[str, Any] = {"features_extractor_class": LightEncoder}
     policy_kwargs |= {} if memory is None else {"memory": memory}
     model = algorithm(policy, env, seed=0, policy_kwargs=policy_kwargs, device="cpu", **kwargs)
     parameters = list(model.policy.parameters())
     before = th.nn.utils.parameters_to_vector(parameters).detach().clone()
-    model.learn(4_000)
+    model.learn(2_000)
     after = th.nn.utils.parameters_to_vector(parameters).detach()
     assert not th.equal(before, after)
     return after
 
 
-_PPO = {"n_steps": 25, "batch_size": 4_000, "n_epochs": 1, "rollout_buffer_class": TeamRolloutBuffer}
-_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 600}
+_PPO = {"n_steps": 25, "batch_size": 2_000, "n_epochs": 1, "rollout_buffer_class": TeamRolloutBuffer}
+_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 300}
 
 
 @pytest.mark.usefixtures("two_threads")

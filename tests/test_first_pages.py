@@ -31,7 +31,7 @@ SETTINGS = {
 }
 APPENDED = {
     "python -m sb3_saf.train": "--size smoke -n 40",
-    "python -m sb3_saf.enjoy": "--episodes 2",
+    "python -m sb3_saf.enjoy": "--episodes 2 --env-kwargs max_cycles:5",
     "python -m sb3_saf.replay": "--env-kwargs max_cycles:5",
 }
 #: What `make check` runs anyhow or what installs from a network: shown by make, not run.

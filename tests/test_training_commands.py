@@ -66,7 +66,7 @@ def test_the_command_trains_what_settings_train(by_hand: dict[str, bytes], tmp_p
 
 def test_options_do_not_change_what_is_learned(settings: Settings, by_hand: dict[str, bytes], tmp_path: Path) -> None:
     assert by_hand == weights_of(train_settings(settings, 3))
-    frequencies: dict[str, Any] = {"eval_freq": 12, "save_freq": 40, "inspect_freq": 10_000, "checkpoint_freq": None}
+    frequencies: dict[str, Any] = {"eval_freq": 12, "save_freq": 40, "inspect_freq": -1, "checkpoint_freq": None}
     options = RunOptions(eval_episodes=4, tensorboard_log=tmp_path, **frequencies)
     folder = tmp_path / "run"
     assert by_hand == weights_of(train_settings(settings, 3, folder, options))

@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as imageio
 import imageio_ffmpeg
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -316,25 +318,23 @@ def test_damaged_results_are_one_line(
     assert f"{name} {words}" in failed(options, capsys, zoo_plot.main)
 
 
-#: Runs two modules, with their words.
-PLOTS = """
-import runpy, sys
-for words in sys.argv[1].split("; "):
-    sys.argv = words.split()
-    runpy.run_module(f"rl_zoo3.plots.{sys.argv[0]}", run_name="__main__")
-"""
-
-
-def test_plots_of_rl_zoo3_read_the_folders(logs: Path, tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore")  # of other projects
+def test_plots_of_rl_zoo3_read_the_folders(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("seaborn")
     pytest.importorskip("rl_zoo3.plots")
-    words = f"plot_train -a saf -e {ENV} -f {logs} -w 1; "
-    words += f"all_plots -a saf mappo -e {ENV} -f {logs} --no-display -o {tmp_path / 'all'}"
-    environment = {**os.environ, "MPLBACKEND": "agg"}
-    result = subprocess.run([sys.executable, "-c", PLOTS, words], env=environment, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert "No data" not in result.stdout and "not found" not in result.stdout
-    assert "SAF" in result.stdout and ENV in result.stdout
+    with matplotlib.rc_context():  # which seaborn changes
+        for words in (
+            f"plot_train -a saf -e {ENV} -f {logs} -w 1",
+            f"all_plots -a saf mappo -e {ENV} -f {logs} --no-display -o {tmp_path / 'all'}",
+        ):
+            monkeypatch.setattr(sys, "argv", words.split())
+            runpy.run_module(f"rl_zoo3.plots.{sys.argv[0]}", run_name="__main__")
+        plt.close("all")
+    printed = capsys.readouterr().out
+    assert "No data" not in printed and "not found" not in printed
+    assert "SAF" in printed and ENV in printed
 
 
 @pytest.mark.parametrize(
