@@ -20,7 +20,7 @@ import pytest
 
 from sb3_saf.experiments import cli
 from sb3_saf.experiments.cell import Job, run_job
-from sb3_saf.experiments.definitions import Cell, RunConfig, Selection, find_experiment
+from sb3_saf.experiments.definitions import EXPERIMENTS, Cell, RunConfig, Selection
 from sb3_saf.experiments.engines import RayEngine, _run_on_ray, inputs_of, require_ray
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import Summary, run
