@@ -77,7 +77,7 @@ class GameReader:
             bounds = [(float(box.low.min()), float(box.high.max())) for box in alike]
             largest = {max(abs(low), abs(high)) for low, high in bounds}
             divided = (0.0, 255.0) in bounds or any(wide_integers(box).any() for box in alike)
-            if divided and np.inf > max(largest) >= _UNEQUAL * min(largest):
+            if divided and 2**31 - 1 > max(largest) >= _UNEQUAL * min(largest):
                 self.notes.append(
                     f"the agents' observations reach up to {sorted(largest)} in one place, and encoders divide whole "
                     "numbers, with what other agents have in their place, by the largest: they hardly see the small "

@@ -433,7 +433,7 @@ class QPLEX(OffPolicyAlgorithm):
         begun = 0 if reset_num_timesteps else self.num_timesteps
         rows = self._rows_until(begun, total_timesteps)
         game_steps = (begun + rows) // self.n_agents
-        if game_steps <= self.learning_starts:
+        if reset_num_timesteps and 0 < game_steps <= self.learning_starts:
             warnings.warn(
                 f"nothing is learned in {game_steps:,} game steps with learning_starts={self.learning_starts:,}; lower "
                 "it, or train longer",

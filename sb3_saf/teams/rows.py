@@ -193,14 +193,19 @@ class TeamSpaces:
                     f"its {TEAM_KEY!r} must be a Box of shape {expected} and dtype {own.dtype}, got {team}"
                 )
             )
-        active, mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
-        n_masked, has_starts = None if mask is None else prod(mask.shape or ()), EPISODE_START_KEY in space.spaces
+        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
+        if active is not None and active != spaces.MultiBinary(n_agents):
+            raise ValueError(_not_a_team_space(f"its {ACTIVE_KEY!r} must be MultiBinary({n_agents}), got {active}"))
+        if action_mask is not None and not (
+            isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
+        ):
+            raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
+        starts = space.spaces.get(EPISODE_START_KEY)
+        if starts is not None and starts != spaces.Discrete(2):
+            raise ValueError(_not_a_team_space(f"its {EPISODE_START_KEY!r} must be Discrete(2), got {starts}"))
+        n_masked = None if action_mask is None else action_mask.shape[0]
         names, conversions = (getattr(agent, name, None) for name in ("names", "conversions"))
-        found = cls(own, n_agents, active is not None, n_masked, state, names, conversions, has_starts)
-        for key, part in found._joint.items():
-            if key in (ACTIVE_KEY, ACTION_MASK_KEY, EPISODE_START_KEY) and space.spaces[key] != part:
-                raise ValueError(_not_a_team_space(f"its {key!r} must be {part}, got {space.spaces[key]}"))
-        return found
+        return cls(own, n_agents, active is not None, n_masked, state, names, conversions, starts is not None)
 
     @cached_property
     def team(self) -> spaces.Box:

@@ -289,8 +289,10 @@ def load_settings(
         if given.get("n_minibatches") is not None:
             raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
         own.pop("n_minibatches", None)
-    if given.get("normalize_advantage", own.get("normalize_advantage")) is False and "rollout_buffer_kwargs" in own:
-        own["rollout_buffer_kwargs"] = own["rollout_buffer_kwargs"] | {"normalize_advantage": None}  # of agents neither
+    if given.get("normalize_advantage", own.get("normalize_advantage")) is False:
+        buffer = dict(own.pop("rollout_buffer_kwargs", None) or {})
+        buffer.pop("normalize_advantage", None)  # the buffer normalises those of each agent
+        own |= {"rollout_buffer_kwargs": buffer} if buffer else {}
     levels = entry_of(read_settings("levels"), environment.yaml_keys, size)
     last = {"env_kwargs": env_kwargs or {}, "policy_kwargs": dict(spec.policy_kwargs)}
     return _build(spec, algo, environment, size, merge(levels, own, given, last))

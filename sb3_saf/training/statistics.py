@@ -96,7 +96,7 @@ def score_matrices(results: pd.DataFrame, task: str = "task") -> dict[str, Float
     :raises ValueError: if a method lacks a task, or a seed of one
     """
     require_columns(results, ("method", "seed", task, "score"))
-    table = results.groupby(["method", "seed", task])["score"].mean().unstack(task)
+    table = results.groupby(["method", "seed", task], observed=True)["score"].mean().unstack(task)
     for (method, seed), is_missing in table.isna().T.items():
         if is_missing.any():
             raise ValueError(

@@ -111,7 +111,7 @@ class TrialReport(BaseCallback):
         assert isinstance(evaluation, SeededEvalCallback)
         self.trial.report(float(evaluation.last_mean_reward), evaluation.n_evaluations)
         if self.trial.should_prune():
-            raise optuna.TrialPruned
+            raise optuna.TrialPruned(f"the trial ended with a team return of {evaluation.last_mean_reward}")
         return True
 
 
