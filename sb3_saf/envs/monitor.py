@@ -84,10 +84,7 @@ class TeamMonitor(TeamVecEnvWrapper):
         self._success_is_told: set[bool] = set()
         self._lengths = np.zeros(self.n_games, dtype=np.int64)
         self._n_steps = 0
-        path = None if filename is None else os.fspath(filename)
-        if path is not None and not path.endswith(Monitor.EXT):  # as in SB3's ResultsWriter
-            path = os.path.join(path, Monitor.EXT) if os.path.isdir(path) else f"{path}.{Monitor.EXT}"
-        self._path = path
+        self._filename = None if filename is None else os.fspath(filename)
         self._writer: ResultsWriter | None = None
 
     def reset(self) -> VecEnvObs:
@@ -176,18 +173,26 @@ class TeamMonitor(TeamVecEnvWrapper):
 
     def _begin_file(self) -> ResultsWriter | None:
         """Create the file at the first step, so that a run that fails earlier touches no file."""
-        if self._path is None:
-            return None
-        if os.path.isfile(self._path):  # of another run
-            number = 1
-            while os.path.exists(f"{self._path}.{number}"):
+        path, number = self._path(), 1
+        if path is not None and os.path.isfile(path):  # of another run
+            while os.path.exists(f"{path}.{number}"):
                 number += 1
-            os.rename(self._path, f"{self._path}.{number}")
-        return self._open(self._path, override_existing=True)
+            os.rename(path, f"{path}.{number}")
+        return self._open(override_existing=True)
 
-    def _open(self, path: str, override_existing: bool) -> ResultsWriter:
+    def _path(self) -> str | None:
+        """Return the path that SB3's ResultsWriter uses."""
+        if self._filename is None or self._filename.endswith(Monitor.EXT):
+            return self._filename
+        if os.path.isdir(self._filename):
+            return os.path.join(self._filename, Monitor.EXT)
+        return f"{self._filename}.{Monitor.EXT}"
+
+    def _open(self, override_existing: bool) -> ResultsWriter | None:
+        if self._filename is None:
+            return None
         header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(getattr(self.venv, "spec", None))}
-        writer = ResultsWriter(path, header, self.info_keywords, override_existing)
+        writer = ResultsWriter(self._filename, header, self.info_keywords, override_existing)
         weakref.finalize(self, writer.close)  # for runs that end by an exception without closing the environment
         return writer
 
@@ -211,7 +216,7 @@ class TeamMonitor(TeamVecEnvWrapper):
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state; lines written to the file after it are cut off, since their episodes are played again."""
-        path, size = self._path, state["file_size"]
+        path, size = self._path(), state["file_size"]
         kept = b""
         if size and path is not None and os.path.isfile(path):
             with open(path, "rb") as file:
@@ -228,16 +233,17 @@ class TeamMonitor(TeamVecEnvWrapper):
         self.episode_count = state["episode_count"]
         self.t_start = state["t_start"]
         self._n_steps = state["n_steps"]
-        if path is None or not self._n_steps:
+        if self._filename is None or not self._n_steps:
             return  # the file is created at the first step
         if self._writer is not None:
             self._writer.close()
             self._writer = None
         if size and len(kept) == size:
-            self._writer = self._open(path, override_existing=False)
+            self._writer = self._open(override_existing=False)
+            assert self._writer is not None
             os.truncate(self._writer.file_handler.fileno(), size)
             return
-        self._path = None
+        self._filename = None
         warnings.warn(
             f"no episodes are written to {path}, which lacks those before the checkpoint: it had {size} bytes "
             f"then, now {len(kept)}",
