@@ -497,7 +497,7 @@ def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
         venv.step_wait()
     assert venv.step(zeros(venv))[1].tolist() == [10, 11] * 2
     venv.close()
-    for closed_call in (lambda: venv.step(zeros(venv)), lambda: venv.get_attr("level"), venv.reset):
+    for closed_call in (lambda: venv.step_async(zeros(venv)), lambda: venv.get_attr("level"), venv.reset):
         with pytest.raises(RuntimeError, match=r"the vector environment is closed \(it was closed\)"):
             closed_call()
 

@@ -342,8 +342,6 @@ class TeamConcatVecEnv(ConcatVecEnv):
 
     def run(self, name: str, *args: Any) -> list[Any]:
         """Call a method in all processes, as :class:`WorkerGames` does."""
-        if self.closed:
-            raise RuntimeError("the vector environment is closed (it was closed); make a new one")
         return [getattr(self, name)(*args)]
 
     def reset_all(self, seeds: Sequence[int | None], options: Sequence[Info | None]) -> tuple[Any, Infos]:

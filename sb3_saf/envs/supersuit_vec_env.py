@@ -94,7 +94,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         self.possible_agents = list(reader.agents)
         #: How each agent's observations and actions become those of rows, for models that act on the game's own.
         self.conversions = tuple(reader.conversions.values())
-        self._begun = self._has_warned = False
+        self._closed = self._begun = self._has_warned = False
         self._actions: Array | None = None
         #: Hashes of the first rows of each game's first episodes, to find games that ignore their seeds.
         self._beginnings: list[list[int]] = []
@@ -113,6 +113,7 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     def reset(self) -> VecEnvObs:
         """Begin an episode in every game; a pending step is cancelled."""
+        self._check_open()
         self._begun, self._actions = False, None
         options = [own or None for own in self._options[:: self.n_agents]]
         observations, self.reset_infos = self._run("reset_all", self._seeds_of_games(), options)
@@ -130,6 +131,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         :param actions: actions of the B rows; those of agents that have ended are ignored
         :raises ValueError: if one is not in the action space; no game is stepped then
         """
+        self._check_open()
         if not self._begun:
             raise RuntimeError("no episode has begun (or one was stopped by an error): call reset() before step()")
         self._actions = self.checked_actions(actions)
@@ -181,10 +183,16 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     def close(self) -> None:
         """Close all games and end the worker processes; a second call does nothing."""
-        self._games.close()
+        if not self._closed:
+            self._closed = True
+            self._games.close()
 
     def _seeds_of_games(self) -> list[int | None]:
         return [None] * self.n_games if self._next_seeds is None else [*self._next_seeds]
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RuntimeError("the vector environment is closed (it was closed); make a new one")
 
     # ---- checkpoints
 
@@ -194,6 +202,7 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     def checkpoint_state(self) -> dict[str, Any]:
         """Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`)."""
+        self._check_open()
         snapshots = [snapshot for some in self._games.run("snapshots") for snapshot in some]
         for snapshot in snapshots:
             if "pickled" in snapshot:
@@ -220,6 +229,7 @@ class SuperSuitVecEnv(TeamVecEnv):
 
     def _ask(self, games: Iterable[int], function: Callable[..., Any], *args: Any) -> list[Any]:
         """Call a function with some games, once each, and return one answer for each entry of ``games``."""
+        self._check_open()
         listed = list(games)
         answers = dict(chain.from_iterable(part.items() for part in self._games.run("ask", listed, function, *args)))
         return [answers[game] for game in listed]
