@@ -147,6 +147,12 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """
         Call a method of the rows' games; ``action_masks``, which MaskablePPO calls, is answered from the observations
         if these have ``action_mask`` and the games have no such method.
+
+        :param method_name: name of the method
+        :param method_args: positional arguments
+        :param indices: rows, None for all
+        :param method_kwargs: keyword arguments
+        :return: one result per row
         """
         self._has_asked_for_masks |= method_name == _ACTION_MASKS
         if self._shows_masks(method_name) and not super().has_attr(method_name):
@@ -273,19 +279,13 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         if ACTIVE_KEY in parts:
             # Rows of agents that take no part may hold a copy of another's, see the games' fill_idle_rows.
             parts[OBS_KEY][parts[ACTIVE_KEY].reshape(-1) == 0] = 0
-        joint = self._joined(parts, self._playing)
+        teams = parts[OBS_KEY].reshape(self.n_games, *self.team_spaces.team.shape)
+        joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0), AGENT_KEY: self._agents.copy()}
+        joint[EPISODE_START_KEY] = (self._playing == 0).reshape(-1).astype(np.int64)
         self._playing = parts.get(ACTIVE_KEY, np.ones_like(self._playing))
-        self._masks_shown = parts.get(ACTION_MASK_KEY)
-        return joint
-
-    def _joined(self, parts: dict[str, Array], played: Array) -> dict[str, Array]:
-        """Return all entries of the rows of whole games; ``played`` (E, N) are agents that were in the step before."""
-        teams = parts[OBS_KEY].reshape(-1, *self.team_spaces.team.shape)
-        joint = {**parts, TEAM_KEY: np.repeat(teams, self.n_agents, axis=0)}
-        joint[AGENT_KEY] = self._agents[: played.size].copy()
-        joint[EPISODE_START_KEY] = (played == 0).reshape(-1).astype(np.int64)
         if ACTIVE_KEY in parts:
             joint[ACTIVE_KEY] = np.repeat(parts[ACTIVE_KEY], self.n_agents, axis=0)
+        self._masks_shown = parts.get(ACTION_MASK_KEY)
         return joint
 
     def _checked_parts(self, obs: Any, what: str, games: Sequence[int] | None = None) -> dict[str, Array]:
@@ -344,11 +344,16 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             return infos
         rows = np.flatnonzero(ended.repeat(self.n_agents))
         self._warn_of_missing_limits(infos, rows)
-        last = self._last_observations([infos[row] for row in rows.tolist()], np.flatnonzero(ended).tolist())
-        for row, *entries in zip(rows.tolist(), *last.values(), strict=True):
-            seen = dict(zip(last, entries, strict=True))
-            info = {**infos[row], TERMINAL_OBSERVATION: TerminalRow(seen, row)}
-            if self.time_limit == "terminal" and TRUNCATED in info:
+        last = self._terminal_parts([infos[row] for row in rows.tolist()], np.flatnonzero(ended).tolist())
+        of_games = last.keys() & {TEAM_KEY, ACTIVE_KEY}
+        by_row = [
+            (one for one in part for _ in range(self.n_agents)) if key in of_games else part
+            for key, part in last.items()
+        ]
+        is_limit_an_end = self.time_limit == "terminal"
+        for row, *entries in zip(rows.tolist(), *by_row, strict=True):
+            info = {**infos[row], TERMINAL_OBSERVATION: TerminalRow(zip(last, entries, strict=True), row)}
+            if is_limit_an_end and TRUNCATED in info:
                 info[TRUNCATED] = False
             infos[row] = info
         return infos
@@ -365,8 +370,8 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             stacklevel=4,
         )
 
-    def _last_observations(self, infos: list[dict[str, Any]], games: list[int]) -> dict[str, Array]:
-        """Return the joint observation of the rows of G ended games, (G N, ...)."""
+    def _terminal_parts(self, infos: list[dict[str, Any]], games: list[int]) -> dict[str, Array]:
+        """Return the parts of the last observations of ended games: (G * N, ...), or (G, ...) if they are of a game."""
         observations: list[Any] = [info.get(TERMINAL_OBSERVATION) for info in infos]
         missing = [divmod(index, self.n_agents) for index, seen in enumerate(observations) if seen is None]
         if missing:
@@ -384,7 +389,13 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             stacked = {key: self._stacked([entry[key] for entry in entries], games, space[key]) for key in entries[0]}
         else:
             stacked = self._stacked(observations, games, space)
-        return self._joined(self._checked_parts(stacked, "terminal observations", games), self._playing[games])
+        parts = self._checked_parts(stacked, "terminal observations", games)
+        return {
+            **parts,
+            TEAM_KEY: parts[OBS_KEY].reshape(len(games), *self.team_spaces.team.shape),
+            AGENT_KEY: np.tile(self._agents[: self.n_agents], len(games)),
+            EPISODE_START_KEY: (self._playing[games] == 0).reshape(-1).astype(np.int64),
+        }
 
     def _stacked(self, observations: list[Any], games: list[int], space: spaces.Space[Any]) -> Array:
         try:
