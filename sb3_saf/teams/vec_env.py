@@ -174,17 +174,20 @@ def layers(venv: VecEnv) -> Iterator[VecEnv]:
 
 def find_n_agents(venv: VecEnv) -> int | None:
     """
-    Return N of a vector environment of flattened teams, through any wrappers; None if no layer states it.
+    Return N of a vector environment of flattened teams, through any wrappers.
 
     SB3's look-up through wrappers fails if two layers have the attribute, so each layer is checked.
+
+    :return: N, or None if no layer states it
     """
-    stated = next(_of_layers(venv, "n_agents"), None)
-    return None if stated is None else check_count("n_agents", stated)
+    *_, innermost = layers(venv)
+    stating = (layer for layer in layers(venv) if _has_own(layer, "n_agents"))
+    value = getattr(next(stating, innermost), "n_agents", None)
+    return None if value is None else check_count("n_agents", value)
 
 
-def _of_layers(venv: VecEnv, name: str) -> Iterator[Any]:
-    """Yield an attribute of the layers that have it themselves, outermost first."""
-    return (getattr(one, name) for one in layers(venv) if name in vars(one) or hasattr(type(one), name))
+def _has_own(layer: VecEnv, name: str) -> bool:
+    return name in vars(layer) or hasattr(type(layer), name)
 
 
 def shares_reward(venv: VecEnv) -> bool:
@@ -193,7 +196,8 @@ def shares_reward(venv: VecEnv) -> bool:
 
     Layers with an attribute ``shares_reward`` say so: ``SharedReward``, HECOGrid, SMAX, Overcooked.
     """
-    return any(_of_layers(venv, "shares_reward"))
+    found: list[Any] = [layer for layer in layers(venv) if _has_own(layer, "shares_reward")]
+    return any(layer.shares_reward for layer in found)
 
 
 def share_of_sum(venv: VecEnv) -> float:
@@ -202,7 +206,8 @@ def share_of_sum(venv: VecEnv) -> float:
 
     Layers with an attribute ``share_of_sum`` say so: ``TeamMonitor`` and ``SharedReward``.
     """
-    return math.prod(_of_layers(venv, "share_of_sum"))
+    found: list[Any] = [layer for layer in layers(venv) if _has_own(layer, "share_of_sum")]
+    return math.prod(layer.share_of_sum for layer in found)
 
 
 def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
@@ -235,7 +240,8 @@ def require_n_agents(venv: VecEnv, n_agents: int | None = None) -> int:
 def agent_names(venv: VecEnv) -> list[str]:
     """Return the names of the N agents, in index order; their indices if the environment does not name them."""
     n_agents = require_n_agents(venv)
-    return [str(name) for name in next(_of_layers(venv, "possible_agents"), range(n_agents))]
+    named = (vars(layer)["possible_agents"] for layer in layers(venv) if "possible_agents" in vars(layer))
+    return [str(name) for name in next(named, range(n_agents))]
 
 
 def team_dones(dones: Array, n_agents: int, alone: bool = False) -> npt.NDArray[np.bool_]:
@@ -282,7 +288,7 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
     :param training: environment of teams; one without an attribute ``seeded_with`` passes
     :raises ValueError: if both are the same games, or contain one with the same seed
     """
-    if training.unwrapped is evaluation.unwrapped:
+    if [*layers(training)][-1] is [*layers(evaluation)][-1]:
         raise ValueError("expected games of evaluation that are not trained on, got the games of training themselves")
     common = set(game_seeds_of(training) or ()) & set(game_seeds_of(evaluation) or ()) - {None}
     if common:
@@ -295,7 +301,8 @@ def check_other_games(training: VecEnv, evaluation: VecEnv) -> None:
 
 def game_seeds_of(venv: VecEnv) -> tuple[int | None, ...] | None:
     """Return the last seeds of the games (None for random ones), or None if the environment does not record them."""
-    return getattr(venv.unwrapped, "seeded_with", None)
+    *_, innermost = layers(venv)
+    return getattr(innermost, "seeded_with", None)
 
 
 def check_finite(name: str, values: Array, n_agents: int, step: int, games: Sequence[int] | None = None) -> None:
