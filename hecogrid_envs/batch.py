@@ -195,10 +195,11 @@ class GameBatch:
         return kernel
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_kernel"}  # which cannot be pickled
+        return {name: value for name, value in self.__dict__.items() if name not in ("_world", "_kernel")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
+        self._world = world_of(self.task, self.params)
         self._kernel = self._compiled_kernel()
 
     def _play(

@@ -210,7 +210,8 @@ class RandomPolicy:
         space = self.action_space
         assert not isinstance(space, spaces.Box), "Box actions have no masks"
         keys = np.where(masks, self._rng.random(masks.shape), -1.0)
-        parts = np.split(keys, np.cumsum(choices_of(space))[:-1], axis=1)
+        sizes = space.nvec.reshape(-1) if isinstance(space, spaces.MultiDiscrete) else choices_of(space)
+        parts = np.split(keys, np.cumsum(sizes)[:-1], axis=1)
         actions = np.stack([part.argmax(axis=1) for part in parts], axis=1).reshape(len(masks), *(space.shape or ()))
         return (actions + getattr(space, "start", 0)).astype(space.dtype)
 

@@ -71,11 +71,11 @@ class GameReader:
             )
         boxes: dict[tuple[Key, ...], list[spaces.Box]] = {}
         for place, leaf in (entry for space in own_spaces for entry in innermost(space)):
-            if isinstance(leaf, spaces.Box):
+            if isinstance(leaf, spaces.Box) and leaf.low.size:
                 boxes.setdefault(place, []).append(leaf)
         for alike in boxes.values():
             bounds = [(float(box.low.min()), float(box.high.max())) for box in alike]
-            largest = {max(abs(low), abs(high)) for low, high in bounds}
+            largest = {max(abs(low), abs(high)) for low, high in bounds if low < high} or {1.0}
             divided = (0.0, 255.0) in bounds or any(wide_integers(box).any() for box in alike)
             if divided and 2**31 - 1 > max(largest) >= _UNEQUAL * min(largest):
                 self.notes.append(
