@@ -718,6 +718,7 @@ PICTURE = spaces.Box(0, 255, (20, 20, 3), np.uint8)
         ([spaces.Dict(a=spaces.Box(0, 255, (20, 20), np.uint8), b=SHARES)], True),
     ],
 )
+@pytest.mark.filterwarnings("ignore:the agents' observations reach up to")
 def test_parts_of_observations_are_scaled_and_pictures_convolved(shown: Any, convolves: bool) -> None:
     has_convolutions, largest = read_by(make_team_env(Showing(*shown), 2, seed=0))
     assert has_convolutions == convolves and 0.8 < largest <= 1
