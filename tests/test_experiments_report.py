@@ -20,7 +20,7 @@ from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection, e
 from sb3_saf.experiments.report import Content, known, losses
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
-from sb3_saf.experiments.tables import Frames, beside, complete, marl_eval, read_results, seconds_at
+from sb3_saf.experiments.tables import Frames, beside, complete, frame_of_curves, marl_eval, read_results, seconds_at
 from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import finish_run
@@ -185,15 +185,18 @@ def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_commits_that_differ_are_in_the_warning(folder: Path, page: str, tmp_path: Path) -> None:
+def test_commits_and_settings_that_differ_are_in_the_warning(folder: Path, page: str, tmp_path: Path) -> None:
     assert "**Cells differ" not in page
     part = shutil.copytree(folder, tmp_path / "part")
     cell = part / "cells" / "TeamSupport-c1-h1" / "saf" / "seed-0"
     description = read_json(cell / "run.json")
     description["versions"]["commit"] = "another"
+    description["settings"]["hyperparams"]["learning_rate"] = 0.123
     write_json(cell / "run.json", description)
     finish_run(cell)
-    assert "**Cells differ in commit.**" in report(part, "--tasks", "TeamSupport", "--levels", "1")
+    assert "**Cells differ in commit, settings of training.**" in report(
+        part, "--tasks", "TeamSupport", "--levels", "1"
+    )
 
 
 def test_a_killed_report_leaves_the_old_one(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,6 +278,8 @@ def test_published_results_of_other_games_are_left_out(folder: Path) -> None:
     theirs = read_results(folder, "coordination")
     mine = Frames(theirs.tests[theirs.tests["method"] == "saf"].assign(method="mine"), theirs.curves.iloc[:0])
     assert set(beside(mine, theirs).tests["method"]) == {"mine", "saf", "ippo", "random"}
+    alone = Frames(theirs.tests[theirs.tests["method"] == "random"], frame_of_curves(Results(folder), []))
+    assert set(beside(mine, alone).tests["method"]) == {"mine", "random"}
     for other in ({"max_return": 100}, {"game": "larger grid"}):
         with pytest.warns(UserWarning, match=r"published results are of other games .* 80 game steps: none is beside"):
             assert set(beside(mine, Frames(theirs.tests.assign(**other), theirs.curves)).tests["method"]) == {"mine"}

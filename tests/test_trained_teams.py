@@ -212,6 +212,13 @@ def test_an_unknown_team_names_the_nearest(published: Path, env: str, method: st
         load_team(env, method, published)
 
 
+def test_a_team_without_weights_is_no_unknown_one(teams: Path) -> None:
+    (teams / LEVEL / "ippo" / WEIGHTS).unlink()
+    assert team_names(teams) == NAMES
+    with pytest.raises(ExportError, match=f"{WEIGHTS} is missing; restore it from the repository"):
+        load_team(LEVEL, "ippo", teams)
+
+
 def test_a_folder_without_teams_says_where_they_are(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="got none; name the folder trained_teams of the repository"):
         load_team(LEVEL, "saf", tmp_path)

@@ -76,7 +76,9 @@ class GameReader:
         for alike in boxes.values():
             bounds = [(float(box.low.min()), float(box.high.max())) for box in alike]
             largest = {max(abs(low), abs(high)) for low, high in bounds if low < high} or {1.0}
-            divided = (0.0, 255.0) in bounds or any(wide_integers(box).any() for box in alike)
+            is_kept = len(alike[0].shape) == 1 or all(box.dtype.kind in "iu" for box in alike)
+            divided = is_kept and any(wide_integers(box).any() for box in alike)
+            divided |= (min(low for low, _ in bounds), max(high for _, high in bounds)) == (0, 255)
             if divided and 2**31 - 1 > max(largest) >= _UNEQUAL * min(largest):
                 self.notes.append(
                     f"the agents' observations reach up to {sorted(largest)} in one place, and encoders divide whole "

@@ -222,10 +222,12 @@ def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
             run_job(folder)
         if is_shared:
             return None
+        log.flush()
         result, buffer = folder / "result", io.BytesIO()
         with zipfile.ZipFile(buffer, "w") as archive:  # models are compressed already
             for path in sorted(path for path in result.rglob("*") if path.is_file()):
                 archive.write(path, path.relative_to(result).as_posix())
+            archive.write(folder / "log.txt", "log.txt")
         return buffer.getvalue()
 
 

@@ -477,5 +477,7 @@ def _versions(content: Content) -> str:
                     variants.setdefault(name, set()).add(str(version))
     lines = [f"{name} {' and '.join(sorted(versions))}" for name, versions in variants.items()]
     mixed = [name for name, versions in variants.items() if len(versions) > 1]
+    trainings = content.frames.tests.groupby(["method", "task", "train_level"])["training"]
+    mixed += ["settings of training"] if (trainings.nunique() > 1).any() else []
     warning = f" **Cells differ in {', '.join(mixed)}.**" if mixed else ""
     return f"Versions: {', '.join(lines)}.{warning}"

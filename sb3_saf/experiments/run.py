@@ -130,6 +130,7 @@ def run(
     todo = [cell for cell in cells if results.missing_tests(cell)]
     progress = _Progress(todo, config, results, engine, options or CellOptions())
     results.save_config(config)  # of settings with which all cells can be made
+    results.agree(config)  # another run may have begun meanwhile
     results.add_selection(experiment, selection)
     for error in results.damaged.values():
         print(f"damaged, what it belongs to is run again: {error}")

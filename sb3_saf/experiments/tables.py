@@ -259,6 +259,8 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     """
     rows: list[dict[str, Any]] = []
     results = Results(folder)
+    if results.config() is None:
+        raise ValueError(f"expected a folder of experiments with its settings.json, got {folder}")
     for path in sorted(folder.glob("*/selections")):
         tests = frame_of_tests(results, requested(results.experiment(path.parent.name), results))
         if tests.empty:
@@ -275,9 +277,10 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     for name, row in best.items():
         source, team = Run(folder / "cells" / row["cell"]), target / name
         check_runs_no_code(source.description["settings"], source.folder)
-        shutil.rmtree(team, ignore_errors=True)
         with closing(source.settings.make_env(source.seed, evaluation=True, n_envs=1)) as games:
-            save_weights(make_policy(source.settings, source.folder / BEST_MODEL, games), team / WEIGHTS)
+            policy = make_policy(source.settings, source.folder / BEST_MODEL, games)
+        shutil.rmtree(team, ignore_errors=True)
+        save_weights(policy, team / WEIGHTS)
         returns = read_json(source.folder / "tests" / f"{row['level']}.json")["plays"][0]["returns"]
         row = {key: value for key, value in row.items() if value == value and "seconds" not in key}  # no NaN
         versions = {
@@ -308,7 +311,8 @@ def frame_of_curves(results: Results, cells: Iterable[Cell]) -> pd.DataFrame:
                 {"game_steps": steps, "processor_seconds": seconds, "score": evaluations["return_mean"]}
             )
             curves.append(curve.assign(**names, seed=cell.seed))
-    return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame()
+    columns = ["game_steps", "processor_seconds", "score", "method", "task", "level", "seed"]
+    return pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=columns)
 
 
 def seconds_at(steps: pd.Series, training: pd.DataFrame, total: float) -> Floats:

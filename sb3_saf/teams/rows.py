@@ -95,7 +95,9 @@ class TerminalRow(dict[str, Any]):
     :param row: index of the row, whose memory policies use for the value of the observation; (K,) for K observations
     """
 
-    def __init__(self, entries: Mapping[str, Any], row: int | npt.NDArray[np.int64]) -> None:
+    def __init__(
+        self, entries: Mapping[str, Any] | Iterable[tuple[str, Any]], row: int | npt.NDArray[np.int64]
+    ) -> None:
         super().__init__(entries)
         self.row = row
 

@@ -380,8 +380,8 @@ def load_team(env: str, method: str, folder: str | Path | None = None, *, device
     """
     Load a published team, without running code from its files.
 
-    The model has as many games as in its training, none of which it was trained or selected on: ``evaluate_team(model,
-    model.get_env(), 100)``, ``model.predict(own_observation)``.
+    The model has as many games as in its training, none of which it was trained on; the first ones are those of its
+    row: ``evaluate_team(model, model.get_env(), 100)``, ``model.predict(own_observation)``.
 
     :param env: task and level, such as ``"TeamSupport-c2-h1"``, or ``"smax/2s3z"``
     :param method: such as ``"saf"``
@@ -404,7 +404,8 @@ def load_team(env: str, method: str, folder: str | Path | None = None, *, device
 def team_names(folder: str | Path | None = None) -> list[str]:
     """Return the names of all teams of a folder, such as ``"TeamSupport-c2-h1/saf"``; ValueError if there is none."""
     folder = TEAMS if folder is None else Path(folder)
-    names = sorted(path.parent.relative_to(folder).as_posix() for path in folder.glob(f"*/*/{WEIGHTS}"))
+    files = [path for name in (WEIGHTS, RUN_FILE, FINISHED) for path in folder.glob(f"*/*/{name}")]
+    names = sorted({path.parent.relative_to(folder).as_posix() for path in files})
     if not names:
         raise ValueError(f"expected teams in {folder}, got none; name the folder trained_teams of the repository")
     return names
