@@ -167,6 +167,8 @@ def test_an_experiment_of_ones_own() -> None:
     assert Cell("saf", "a.b:c", Level(), 0).id == "a.b-c-default/saf/seed-0"
     with pytest.raises(ValueError, match="--vary cannot take level, a column of the tables"):
         own_experiment("mine", ["a"], {"level": [1, 2]})
+    with pytest.raises(ValueError, match="span"):
+        own_experiment("mine", ["a"], {"span": [1, 2]})
     with pytest.raises(ValueError, match="--vary takes one parameter, got a, b"):
         own_experiment("mine", ["a.b"], {"a": [1], "b": [2]})
     with pytest.raises(ValueError, match="expects numbers or words, such as a:"):

@@ -205,18 +205,8 @@ class Experiment(NamedTuple):
 _COLUMNS: Final = {
     *("method", "task", "train_level", "level", "max_return", "game", "training", "seed", "game_steps"),
     *("best_game_steps", "episodes", "actions", "return_mean", "return_low", "return_high", "return_sd", "return_last"),
-    *(
-        "return_most_likely",
-        "return_last_most_likely",
-        "success_rate",
-        "length",
-        "low",
-        "span",
-        "score",
-        "agent_returns",
-        "commit",
-    ),
-    *("processor_seconds", "wall_seconds_training", "wall_seconds_test", "processor", "cell"),
+    *("return_most_likely", "return_last_most_likely", "success_rate", "length", "score", "agent_returns", "commit"),
+    *("processor_seconds", "wall_seconds_training", "wall_seconds_test", "processor", "cell", "low", "span"),
 }
 
 
