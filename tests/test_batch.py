@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -192,6 +193,16 @@ def test_games_of_a_snapshot_are_those_that_were_played(task: str, rules: Rules)
         actions = rng.integers(7, size=(N_GAMES, 6))
         for one, other in zip(batch.advance(actions), fresh.advance(actions), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_pickles_have_the_games_without_what_follows_from_their_settings() -> None:
+    """The tables of a level, whose form changes between versions, are made anew."""
+    batch = played()
+    content = pickle.dumps(batch)
+    assert b"World" not in content
+    copy, actions = pickle.loads(content), np.full((N_GAMES, 6), 2)
+    for one, other in zip(batch.advance(actions), copy.advance(actions), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def _set(name: str, value: Any) -> Callable[[dict[str, Any]], object]:

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -304,6 +304,18 @@ def test_other_settings_are_refused(undisturbed: Path) -> None:
     assert "overrides.gamma was None, now 0.9" in message
     assert "size was 'smoke', now 'small'" in refused(undisturbed, RunConfig("small"))
     assert "episodes was 32, now 8" in refused(undisturbed, replace(SMOKE, episodes=8))
+
+
+def test_of_two_starts_with_other_settings_one_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other one has written its settings since this one looked for them."""
+    config = Results.config
+    monkeypatch.setattr(Results, "config", lambda results: None)
+    monkeypatch.setattr(Results, "save_config", lambda *_: monkeypatch.setattr(Results, "config", config))
+    write_json(tmp_path / "settings.json", asdict(replace(SMOKE, eval_freq=20)))
+    engine = InlineEngine()
+    with pytest.raises(ValueError, match="have other settings: eval_freq was 20, now 60"):
+        run_inline(tmp_path, engine=engine)
+    assert not engine.jobs
 
 
 def test_changed_files_of_zoo_configs_are_refused(undisturbed: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sb3_saf import ExportError, evaluate_team, load_team, load_weights, save_weights
-from sb3_saf.experiments import cli
+from sb3_saf.experiments import cli, tables
 from sb3_saf.experiments.definitions import EXPERIMENTS, RunConfig, Selection
 from sb3_saf.experiments.results import Results
 from sb3_saf.experiments.run import run
@@ -118,6 +118,19 @@ def test_the_best_seed_of_each_method_is_published_with_its_row(experiments: Pat
         (best,) = (one for one in mine if one["cell"] == row["cell"])
         assert row["return_mean"] == float(best["return_mean"]) == max(float(one["return_mean"]) for one in mine)
         assert np.mean([float(text) for text in row["returns"].split()]) == row["return_mean"]
+
+
+def test_a_team_stays_until_the_next_one_can_be_made(
+    experiments: Path, teams: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise ValueError("its suite is not installed")
+
+    monkeypatch.setattr(tables, "make_policy", fail)
+    with pytest.raises(ValueError, match="its suite is not installed"):
+        tables.publish(experiments, teams)
+    assert len(team_names(teams)) == len(METHODS)
+    assert check_team(NAMES[0], teams, batches=1)
 
 
 def test_published_files_name_no_computer_and_are_small(published: Path) -> None:

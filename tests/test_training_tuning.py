@@ -16,9 +16,9 @@ from optuna.trial import TrialState
 from sb3_saf import LightEncoder
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run
-from sb3_saf.training.run import SeededEvalCallback
+from sb3_saf.training.run import RunOptions, SeededEvalCallback
 from sb3_saf.training.settings import ALGOS, load_settings
-from sb3_saf.training.tune import sample_overrides, to_overrides
+from sb3_saf.training.tune import Tuning, run_trial, sample_overrides, to_overrides
 from tests.test_training_commands import failed
 
 ENV = "TeamTogether-v0"
@@ -88,6 +88,17 @@ def test_a_failed_trial_is_never_complete(
     assert f"none of 1 trials was completed{why}" in line
     (trial,) = load_study(str(tmp_path / "study.log")).trials
     assert (trial.state, trial.value) == (TrialState.PRUNED, None)
+
+
+def test_the_pruner_ends_a_trial() -> None:
+    """At its first evaluation, whose return is what the trial has."""
+    study = optuna.create_study(pruner=optuna.pruners.ThresholdPruner(lower=1e9))
+    settings = load_settings("mappo", ENV, "smoke", overrides={"game_steps": 160})
+    tuning = Tuning(seed=0, options=RunOptions(eval_episodes=2), n_evaluations=2)
+    study.optimize(lambda trial: run_trial(trial, settings, tuning), n_trials=1)
+    (trial,) = study.trials
+    assert trial.state is TrialState.PRUNED and list(trial.intermediate_values) == [1]
+    assert trial.value == trial.intermediate_values[1] >= 0
 
 
 def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Path) -> None:
