@@ -80,6 +80,8 @@ PAIRS: Final = (
     ("saf", "saf-no-pool"),
     ("saf", "saf-no-ks"),
     ("saf", "saf-paper"),
+    ("saf-paper", "mappo"),
+    ("saf-paper", "ippo-separate"),
     ("saf-paper", "saf-paper-no-pool"),
     ("saf-no-pool", "saf-paper-no-pool"),
     ("mappo", "mappo-separate"),
@@ -237,6 +239,10 @@ def answer(frames: Frames) -> str:
             f"- Without the games where no method collects {100 * _FLOOR:.0f} %: SAF minus {WORDS['mappo']} "
             f"{show(found.estimate)} over {found.n}; {means.min():+.1f} to {means.max():+.1f} in single settings."
         )
+    last = tests.assign(return_mean=tests["return_last"])
+    by_last = [(other, difference(last, "saf", other)) for other in ("mappo", "ippo-separate")]
+    values = (f"SAF minus {WORDS[other]} {show(found.estimate)}" for other, found in by_last if found is not None)
+    lines.append(f"- Of last policies in the place of the best of 20: {', '.join(values)}.")
     early = {
         (_game(f"{task} {level}"), task, seed): _lead_at_equal_time(rows, ("mappo", "saf"))
         for (task, level, seed), rows in frames.curves.groupby([*_COLUMNS, "seed"])
@@ -524,7 +530,8 @@ def add(name: str, folder: Path, raw: Path = RAW) -> None:
     """Add the finished cells of an experiment, ``RESULTS/EXPERIMENT``, to the raw data, in the place of older ones."""
 
     def cells(frame: pd.DataFrame) -> pd.Series:
-        return frame[["method", *_COLUMNS, "seed"]].astype(str).agg("/".join, axis=1)
+        names = ["method", *(["train_level"] if "train_level" in frame else []), *_COLUMNS, "seed"]
+        return frame[names].astype(str).agg("/".join, axis=1)
 
     tests, together = read_results(folder.parent, folder.name)
     if (raw / name).is_dir():

@@ -108,7 +108,8 @@ def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
         is_elsewhere = not one.is_own and BASELINES.name not in one.source
         if is_elsewhere and game == task.game and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
             yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
-    here = baselines[(baselines["task"] == task.game) & (baselines["game_steps"] >= task.game_steps / 2)]
+    is_near = baselines["game_steps"].between(task.game_steps / 2, 2 * task.game_steps)
+    here = baselines[(baselines["task"] == task.game) & is_near]
     for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):
         yield _over_seeds(trainings["return"]), f"{program} after {game_steps:,} game steps: `{BASELINES.name}`"
 

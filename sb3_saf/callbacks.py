@@ -205,7 +205,7 @@ class TeamEvalCallback(EvalCallback):
         self.evaluations_agent_results: list[list[list[float]]] = []
         self._next_evaluation = 0
         self._is_done_for_rollout = False
-        #: Seconds of the evaluations of this training.
+        #: Seconds of all evaluations.
         self.seconds = 0.0
 
     def _init_callback(self) -> None:
@@ -217,7 +217,6 @@ class TeamEvalCallback(EvalCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self.seconds = 0.0
         self._plan_next()
 
     def _on_rollout_start(self) -> None:

@@ -304,7 +304,7 @@ class TestRandomPolicy:
 
     def test_masks_of_actions_with_two_axes(self) -> None:
         """Each mask allows one choice per dimension, of 2, 3, 4 and 2."""
-        space, legal = spaces.MultiDiscrete([[2, 3], [4, 2]]), np.array([[1, 0, 3, 1], [0, 2, 1, 1]])
+        space, legal = spaces.MultiDiscrete(np.array([[2, 3], [4, 2]])), np.array([[1, 0, 3, 1], [0, 2, 1, 1]])
         masks = np.concatenate([legal[:, [i]] == np.arange(n) for i, n in enumerate((2, 3, 4, 2))], axis=1)
         actions, _ = RandomPolicy(space, seed=0).predict(np.zeros((2, 3)), action_masks=masks)
         np.testing.assert_array_equal(actions, legal.reshape(2, 2, 2))

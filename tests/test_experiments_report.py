@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -270,6 +271,12 @@ def test_marl_eval_gets_means_over_the_episodes_of_complete_runs(folder: Path) -
     for step in ("step_0", "absolute_metrics"):
         (value,), (score,) = run[step]["return"], run[step]["score"]
         assert score == pytest.approx((value - means.min()) / (means.max() - means.min()))
+    seldom = frames.curves[(frames.curves["method"] != "ippo") | (frames.curves["game_steps"] == 80)]
+    seldom = seldom.assign(game_steps=seldom["game_steps"].mask(seldom["method"] == "ippo", 60))
+    run = marl_eval(Frames(frames.tests, seldom), "x")["x"]["teamsupport_c1_h1"]["saf"]["seed_1"]
+    own = frames.curves.query("method == 'saf' and task == 'TeamSupport' and level == 'c1-h1' and seed == 1")["score"]
+    assert list(run) == ["step_0", "absolute_metrics"] and run["step_0"]["step_count"] == 60
+    assert run["step_0"]["return"] == [pytest.approx(own.mean())]  # half way between 40 and 80
     lacking = Frames(frames.tests[(frames.tests["method"] != "ippo") | (frames.tests["seed"] == 0)], frames.curves)
     assert list(marl_eval(lacking, "x")["x"]["teamsupport_c1_h1"]["saf"]) == ["seed_0"]
 
@@ -319,12 +326,17 @@ def test_aggregates_compare_like_with_like() -> None:
 def test_results_stand_beside_what_is_known_of_the_same_games(tmp_path: Path) -> None:
     experiment, results = EXPERIMENTS["coordination"], Results(tmp_path)
     config, cells = RunConfig("small"), expand(experiment, Selection((0,), ("saf",)), RunConfig("small"))
-    rows = [("TeamSupport", "saf", "c2-h1", "c2-h1", math.nan, 17.0, 200_000)]
+    rows: list[tuple[Any, ...]] = [("TeamSupport", "saf", "c2-h1", "c2-h1", math.nan, 17.0, 200_000)]
     names = ["task", "method", "train_level", "level", "success_rate", "return_mean", "game_steps"]
     frames = Frames(pd.DataFrame(rows, columns=names), pd.DataFrame())
     text = known(Content(experiment, config, results, cells, [], frames, []))
     line = "TeamSupport, c=2, h=1, SAF: return, sum over agents: 17; random 1.38; script that sees 7 x 7 tiles 17.03"
     assert [part[2:] for part in text.splitlines()[2:]] == [line]
+    unseen = expand(EXPERIMENTS["ood-coordination"], Selection((0,), ("saf",), ("TeamSupport",)), config)
+    rows = [("TeamSupport", "saf", "c2-h1", "c1-h1", math.nan, 9.0, 200_000)]
+    frames = Frames(pd.DataFrame(rows, columns=names), pd.DataFrame())
+    text = known(Content(EXPERIMENTS["ood-coordination"], config, results, unseen, [], frames, []))
+    assert "TeamSupport, c=1, h=1 (trained at c=2, h=1), SAF: return, sum over agents: 9; random" in text
 
 
 def test_a_suites_task_has_a_slash(tmp_path: Path) -> None:

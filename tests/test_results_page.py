@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -45,3 +46,21 @@ def test_cells_trained_again_replace_the_older_ones(tmp_path: Path) -> None:
         before, after = (pd.read_csv(folder / "parts" / file) for folder in (paper.RAW, tmp_path / "raw"))
         twice = (after.groupby("method")[column].sum() / before.groupby("method")[column].sum()).round(3)
         assert len(after) == len(before) and dict(twice[twice != 1]) == {"saf-no-ks": 2}
+    part = tmp_path / "part" / "ood-ablation"
+    part.mkdir(parents=True)
+    for file, level in ((RUNS, "train_level"), (CURVES, "level")):
+        frame = pd.read_csv(paper.RAW / "ood-ablation" / file)
+        frame[frame[level] == "c2-h1"].to_csv(part / file, index=False)
+    shutil.copytree(paper.RAW / "ood-ablation", tmp_path / "raw" / "ood-ablation")
+    paper.add("ood-ablation", part, raw=tmp_path / "raw")  # tests at the same levels of teams trained at others stay
+    assert len(pd.read_csv(tmp_path / "raw" / "ood-ablation" / RUNS)) == len(
+        pd.read_csv(paper.RAW / "ood-ablation" / RUNS)
+    )
+
+
+def test_trainings_of_others_stand_beside_those_of_similar_length() -> None:
+    task = suite_results.Task("jaxmarl/MPE_simple_spread_v3", 1_000_000)
+    lengths = (400_000, 500_000, 2_000_000, 2_100_000)
+    rows = [{"task": task.game, "program": "P", "game_steps": steps, "return": -1.0} for steps in lengths]
+    notes = [note for _, note in suite_results.beside(task, pd.DataFrame(rows)) if note.startswith("P")]
+    assert [note.split()[2] for note in notes] == ["500,000", "2,000,000"]

@@ -30,7 +30,9 @@ from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run, finish_run, training_curve, write_run
 from sb3_saf.training.plot import describe, find_runs, setting_names
 from sb3_saf.training.settings import load_settings
+from sb3_saf.training.yaml_files import Size
 from tests.test_training_commands import failed
+from tests.toy_envs import CounterEnv
 
 ENV = "TeamTogether-v0"
 
@@ -287,6 +289,36 @@ def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: 
     fake_run(tmp_path, 3, options={"initial_model": {"path": "old.zip", "sha256": "1"}})
     expected = ["saf", "saf deterministic_eval=True eval_env_kwargs=coordination:3", "saf trained_agent=old.zip"]
     assert list(describe(find_runs(tmp_path))["method"]) == expected
+    shutil.rmtree(tmp_path / "saf" / f"{ENV}_1")
+    shutil.rmtree(tmp_path / "saf" / f"{ENV}_3")
+    settings = load_settings("mappo", ENV, "smoke")
+    write_run(tmp_path / "mappo" / f"{ENV}_1", settings.as_dict(), 0, "")
+    assert set(describe(find_runs(tmp_path))["method"]) == {"mappo", expected[1]}  # beside another method, too
+
+
+def sized_game(size: int) -> CounterEnv:
+    """Make a game of a parameter that is named as a column of the table."""
+    return CounterEnv(max_cycles=size)
+
+
+def test_a_parameter_of_a_game_may_be_named_as_a_column(tmp_path: Path) -> None:
+    sizes: list[Size] = ["small", "smoke"]
+    for number, size in enumerate(sizes, start=1):
+        settings = load_settings("saf", f"{__name__}:sized_game", size, {"size": 8})
+        write_run(tmp_path / "saf" / f"Sized_{number}", settings.as_dict(), 0, "")
+    table = describe(find_runs(tmp_path))
+    assert sorted(table["size"]) == sizes and set(table["size of the game"]) == {8}
+
+
+def test_runs_of_games_that_are_not_registered_are_found_by_others_names(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(logs, tmp_path / "logs")
+    settings = {**load_settings("saf", ENV, "smoke").as_dict(), "env": "Elsewhere-v0"}
+    write_run(folder / "saf" / "Elsewhere-v0_1", settings, 0, "")
+    assert len(find_runs(folder, env_ids=[ENV])) == len(find_runs(logs, env_ids=[ENV]))
+    words = ["-f", str(folder), "-o", "a.png", "--gym-packages", "nowhere"]
+    assert "cannot import 'nowhere'" in failed(words, capsys, zoo_plot.main)
 
 
 def test_a_figure_from_a_folder(logs: Path, tmp_path: Path) -> None:

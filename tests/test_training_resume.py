@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch as th
@@ -65,6 +67,20 @@ def test_a_run_that_was_struck_ends_as_the_undisturbed_one(
     assert not (other / "checkpoints").exists()
     assert [path.name for path in (tmp_path / "run" / algo).iterdir()] == [f"{ENV}_1"]
     assert [path.name for path in (tmp_path / "run" / "tb" / ENV).iterdir()] == [f"{algo}_1"]
+
+
+def test_the_time_of_evaluations_is_that_of_all_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    struck(tmp_path, "saf", "--resume")
+    load = SeededEvalCallback.load_checkpoint_state
+
+    def load_more(callback: SeededEvalCallback, state: dict[str, Any]) -> None:
+        load(callback, {**state, "seconds": state["seconds"] + 1e6})
+
+    monkeypatch.setattr(SeededEvalCallback, "load_checkpoint_state", load_more)
+    train(tmp_path, "saf", "--resume")
+    assert re.search(r"^Evaluation took \d{5,}%", capsys.readouterr().out, re.MULTILINE)
 
 
 def test_ctrl_c_leaves_model_and_checkpoint_and_says_how_to_go_on(

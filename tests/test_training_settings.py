@@ -243,6 +243,22 @@ def test_a_file_refines_another(tmp_path: Path) -> None:
     assert own == base
 
 
+def test_the_later_of_batch_size_and_n_minibatches_counts(tmp_path: Path) -> None:
+    config = tmp_path / "own.yml"
+    config.write_text("base: mappo\ndefault: {sizes: {small: {batch_size: 500}}}", encoding="utf-8")
+    for given, expected in (({}, 500), ({"n_minibatches": 4}, 1000), ({"batch_size": 250}, 250)):
+        assert load_settings("mappo", ENV, overrides=given, config=config).hyperparams["batch_size"] == expected
+    config.write_text("default: {n_envs: 4, n_steps: 10, batch_size: 20, n_minibatches: 2}", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"own\.yml: batch_size and n_minibatches say the same thing"):
+        load_settings("mappo", ENV, config=config)
+
+
+def test_maskable_ppo_takes_no_normalised_values_from_a_file(tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text("base: mappo\ndefault: {policy_kwargs: {normalize_values: true}}")
+    settings = load_settings("mappo", ENV, overrides={"algorithm": "MaskablePPO"}, config=tmp_path / "own.yml")
+    assert "normalize_values" not in settings.hyperparams["policy_kwargs"]
+
+
 def test_names_of_rl_zoo3_in_files(tmp_path: Path) -> None:
     text = "default: {n_timesteps: 1e5, policy: SAFPolicy, n_envs: 2, n_steps: 10, batch_size: 20}"
     (tmp_path / "own.yml").write_text(text, encoding="utf-8")

@@ -142,6 +142,13 @@ def _sampled(algo: str, fixed: dict[str, Any] | None = None) -> dict[str, Any]:
     return sample_overrides(study.ask(), ALGOS[algo], fixed or {})
 
 
+def test_trials_of_a_model_keep_its_shapes(tmp_path: Path) -> None:
+    zoo_train.main([*SMOKE, "-n", "40", "--eval-freq", "-1", "-f", str(tmp_path / "first")])
+    study = tune(tmp_path, "-i", str(tmp_path / "first" / "saf" / f"{ENV}_1" / f"{ENV}.zip"))
+    (trial,) = study.trials
+    assert trial.state is TrialState.COMPLETE and "n_policies" not in trial.params
+
+
 @pytest.mark.parametrize("algo", ALGOS)
 def test_what_is_sampled_joins_the_other_settings(algo: str) -> None:
     settings = load_settings(algo, ENV, "small", overrides=_sampled(algo))

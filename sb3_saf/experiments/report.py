@@ -187,7 +187,7 @@ def _curves(experiment: Experiment, frames: Frames) -> dict[str, Figure]:
             panels.append(pd.concat([part for part in parts if len(part)]).assign(panel=name))
         figure = draw_curves(
             pd.concat(panels, ignore_index=True),
-            title=f"{experiment.name}: {task}, {titles[level]}",
+            title=f"{experiment.name}: {task}, {titles.get(level, level)}",
             panel="panel",
             y_label=_y_label(frames.tests),
             names=WORDS,
@@ -346,7 +346,8 @@ def known(content: Content) -> str:
                 scores = {"return": score} if pd.isna(won) else {"won": won, "return": score}
                 beside = settings.standing(scores, int(game_steps))
                 if beside is not None:
-                    lines.append(f"- {_text(cell.task)}, {_text(level)}, {_name(cell.method)}: {beside.text}")
+                    trained = "" if level == cell.level else f" (trained at {_text(cell.level)})"
+                    lines.append(f"- {_text(cell.task)}, {_text(level)}{trained}, {_name(cell.method)}: {beside.text}")
     return "\n".join(["## Beside known results", "", *lines]) if lines else ""
 
 

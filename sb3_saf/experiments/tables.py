@@ -331,19 +331,21 @@ def marl_eval(frames: Frames, environment: str) -> dict[str, Any]:
     """
     Return results in the format of marl-eval: environment, task, algorithm, run, step, metrics.
 
-    Its functions compare complete data only: settings and seeds that every method has, with as many evaluations.
+    Its functions compare complete data only: settings and seeds that every method has, with as many evaluations. These
+    are at the game steps of the fewest ones, interpolated where others differ.
     Absolute metrics are means over the test episodes of a run; ``score`` is normalised by the largest return.
     """
     tests = _scored(frames.tests).query("train_level == level and game_steps > 0")
     tests = complete(tests.assign(stratum=tests["task"] + " " + tests["level"]))
     curves = dict(list(frames.curves.groupby(["method", "task", "level", "seed"]))) if len(frames.curves) else {}
-    n_steps = min(map(len, curves.values()), default=0)
+    at = min(curves.values(), key=len)["game_steps"].sort_values() if curves else []
     content: dict[str, Any] = {}
     for row in tests.itertuples(index=False):
-        curve = curves[row.method, row.task, row.train_level, row.seed].sort_values("game_steps").tail(n_steps)
+        curve = curves[row.method, row.task, row.train_level, row.seed].sort_values("game_steps")
+        values = np.interp(at, curve["game_steps"], curve["score"]).tolist()
         steps: dict[str, Any] = {
             f"step_{index}": {"step_count": int(step), "return": [value], "score": [(value - row.low) / row.span]}
-            for index, (step, value) in enumerate(zip(curve["game_steps"], curve["score"], strict=True))
+            for index, (step, value) in enumerate(zip(at, values, strict=True))
         }
         steps["absolute_metrics"] = {"return": [row.return_mean], "score": [row.score]}
         task = f"{row.task}_{row.level}".lower().replace("-", "_")

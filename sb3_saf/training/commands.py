@@ -143,6 +143,11 @@ def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -
     """Add ``--env``, ``--env-kwargs`` (with the help ``of_level``) and ``--gym-packages``."""
     parser.add_argument("--env", default="TeamTogether-v0", help=HOW_TO_NAME)
     add_key_values(parser, "--env-kwargs", help=of_level)
+    add_gym_packages(parser)
+
+
+def add_gym_packages(parser: argparse._ActionsContainer) -> None:
+    """Add ``--gym-packages``, see :func:`import_packages`."""
     parser.add_argument(
         "--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import, which register environments"
     )

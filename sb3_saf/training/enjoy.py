@@ -53,10 +53,10 @@ def make_parser() -> argparse.ArgumentParser:
     add_environment_options(parser, "another level than was trained on, such as coordination:3")
     parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="the folder of the training")
     parser.add_argument("--exp-id", type=int, default=0, help="number of the run, 0 for the latest")
-    parser.add_argument(
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
         "--team", metavar="ENV/METHOD", help="a published team, such as TeamSupport-c2-h1/saf, in the place of a run"
     )
-    which = parser.add_mutually_exclusive_group()
     which.add_argument("--load-best", action="store_true", help="the model with the best evaluation")
     which.add_argument("--load-checkpoint", metavar="STEPS", type=int, help="the model saved after these game steps")
     parser.add_argument("--episodes", type=at_least(1), default=32, help="team episodes to measure")

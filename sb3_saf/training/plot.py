@@ -12,7 +12,14 @@ import numpy as np
 
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
-from sb3_saf.training.commands import OneLineParser, require, run_command, user_errors
+from sb3_saf.training.commands import (
+    OneLineParser,
+    add_gym_packages,
+    import_packages,
+    require,
+    run_command,
+    user_errors,
+)
 from sb3_saf.training.folders import FINISHED, RUN_FILE, Run, python_command
 from sb3_saf.training.settings import Settings, load_settings
 
@@ -25,6 +32,8 @@ PROGRAM: Final = "python -m sb3_saf.plot"
 _MOST_NAMED: Final = 2
 #: Value of a parameter that a run leaves to the game.
 _DEFAULT: Final = "default"
+#: Settings that change what scores mean; they are named if any other run of the environment differs.
+_MEASURED: Final = ("deterministic_eval", "env_wrapper", "eval_env_kwargs", "trained_agent")
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -34,6 +43,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("-f", "--log-folder", type=Path, default=Path("logs"), help="where the runs are")
     parser.add_argument("--algos", nargs="+", default=[], help="only these")
     parser.add_argument("--env", nargs="+", default=[], help="only these environments")
+    add_gym_packages(parser)
     parser.add_argument(
         "--source",
         choices=("evaluation", "training"),
@@ -49,6 +59,7 @@ def plot(arguments: Sequence[str] | None = None) -> None:
     """Draw a figure and print its path."""
     options = make_parser().parse_args(arguments)
     require("pandas", "matplotlib")
+    import_packages(options.gym_packages)
     with user_errors():
         figure = _draw(options)
     options.output.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +113,7 @@ def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str
     found: dict[str, list[Run]] = {}
     for path in sorted(folder.glob(f"*/*/{RUN_FILE}")):
         run = Run(path.parent)
-        if not names or run.settings.environment.folder_name in names:
+        if not names or folder_name(run.description["settings"]["env"]) in names:
             found.setdefault(path.parts[-3], []).append(run)
     if not found:
         of = f" of {', '.join(env_ids)}" if env_ids else ""
@@ -136,8 +147,10 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
     rows = []
     for run, kind, own in zip(runs, kinds, from_zoo, strict=True):
         # What all runs of the algorithm at that size share is not named.
-        others = [other for of, other in zip(kinds, from_zoo, strict=True) if of == kind]
-        named = sorted(key for key, value in own.items() if any(other.get(key) != value for other in others))
+        alike = [other for of, other in zip(kinds, from_zoo, strict=True) if of == kind]
+        beside = [other for of, other in zip(kinds, from_zoo, strict=True) if of[2] == kind[2]]
+        others = {key: beside if key in _MEASURED else alike for key in own}
+        named = sorted(key for key, value in own.items() if any(other.get(key) != value for other in others[key]))
         changes = " ".join(f"{key}={own[key]}" for key in named)
         method = f"{kind[0]} {changes}".rstrip()
         if len(named) > _MOST_NAMED:
@@ -145,6 +158,7 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
             method = f"{kind[0]}, variant {numbers.setdefault(changes, len(numbers) + 1)}"
         identity = {"env": run.settings.env_id, "size": run.settings.size, "seed": run.seed}
         level = {**stated[run.settings.env_id], **run.settings.env_kwargs}
+        level = {f"{name} of the game" if name in identity else name: value for name, value in level.items()}
         rows.append({**identity, **level, "run": run, "changes": changes, "method": method})
     table = pd.DataFrame(rows)
     is_finished = np.array([(run.folder / FINISHED).is_file() for run in runs])

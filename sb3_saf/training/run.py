@@ -81,13 +81,14 @@ class SeededEvalCallback(TeamEvalCallback):
             self.logger.record("eval/share_of_published", self.standing.share)
         super()._log(result)
 
-    def checkpoint_state(self) -> dict[str, int]:
-        """Return the counters, for exact resume."""
-        return {"n_evaluations": self.n_evaluations, "evaluated_at": self._evaluated_at}
+    def checkpoint_state(self) -> dict[str, Any]:
+        """Return the counters and the time, for exact resume."""
+        return {"n_evaluations": self.n_evaluations, "evaluated_at": self._evaluated_at, "seconds": self.seconds}
 
-    def load_checkpoint_state(self, state: Mapping[str, int]) -> None:
-        """Restore the counters."""
+    def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
+        """Restore the counters and the time."""
         self.n_evaluations, self._evaluated_at = state["n_evaluations"], state["evaluated_at"]
+        self.seconds = state.get("seconds", 0.0)
 
     def _on_training_end(self) -> None:
         if self.eval_freq > 0 and self._evaluated_at != team_steps(self.model):

@@ -284,11 +284,8 @@ def load_settings(
             arguments.discard("n_minibatches")
         if issubclass(spec.algorithm, MaskablePPO):
             arguments -= {"rollout_buffer_class", "rollout_buffer_kwargs"}
+            own["policy_kwargs"].pop("normalize_values", None)
         own = {key: value for key, value in own.items() if key in arguments}
-    if given.get("batch_size") is not None:
-        if given.get("n_minibatches") is not None:
-            raise ValueError("batch_size and n_minibatches say the same thing; give one of them")
-        own.pop("n_minibatches", None)
     if given.get("normalize_advantage", own.get("normalize_advantage")) is False:
         buffer = dict(own.pop("rollout_buffer_kwargs", None) or {})
         buffer.pop("normalize_advantage", None)  # the buffer normalises those of each agent
@@ -329,6 +326,8 @@ def _checked(entry: Mapping[str, Any], method: AlgorithmSpec, spec: AlgorithmSpe
         if "game_steps" in entry:
             raise ValueError(f"{source}: game_steps and n_timesteps say the same thing; give one of them")
         entry["game_steps"] = entry.pop("n_timesteps")
+    if entry.get("batch_size") is not None and entry.get("n_minibatches") is not None:
+        raise ValueError(f"{source}: batch_size and n_minibatches say the same thing; give one of them")
     if (policy := entry.pop("policy", spec.policy)) != spec.policy:
         raise ValueError(f"{source}: policy={policy!r} is not a setting here; --algo names the policy ({spec.policy})")
     known = {**_OWN_KEYS, **algorithm_arguments(method.algorithm), **algorithm_arguments(spec.algorithm)}

@@ -354,7 +354,9 @@ def _tune(options: argparse.Namespace, command: str) -> None:
     print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
     with user_errors():
         study = optimize(
-            lambda trial: _settings(options, sample_overrides(trial, settings.spec, _fixed(options)))[0],
+            lambda trial: _settings(
+                options, sample_overrides(trial, settings.spec, _fixed(options), with_shapes=beginning is None)
+            )[0],
             tuning,
             command,
             goal,

@@ -67,8 +67,14 @@ _POLICY_SEARCH: Final[dict[str, _Suggest]] = {
 }
 
 
-def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[str, Any]) -> dict[str, Any]:
-    """Sample settings of a trial, as overrides for ``load_settings``, except those that the user has ``fixed``."""
+def sample_overrides(
+    trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[str, Any], *, with_shapes: bool = True
+) -> dict[str, Any]:
+    """
+    Sample settings of a trial, as overrides for ``load_settings``, except those that the user has ``fixed``.
+
+    :param with_shapes: whether weights may have other shapes; False if the trials begin with those of a model
+    """
     known = set(algorithm_arguments(spec.algorithm))
     if {"n_steps", "batch_size"} <= known and "batch_size" not in fixed:
         known.add("n_minibatches")
@@ -82,7 +88,7 @@ def sample_overrides(trial: optuna.Trial, spec: AlgorithmSpec, fixed: Mapping[st
     method = {**({field.name: field.default for field in fields(parts)} if is_dataclass(parts) else {}), **settled}
     searched = {"n_policies": method.get("n_policies", 1) > 1, "n_slots": method.get("knowledge_source", False)}
     for name, suggest in _POLICY_SEARCH.items():
-        if searched[name] and name not in settled:  # of the parts that the method has
+        if with_shapes and searched[name] and name not in settled:  # of the parts that the method has
             suggest(trial, name)
     return to_overrides(trial.params)
 

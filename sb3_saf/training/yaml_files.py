@@ -25,6 +25,8 @@ BASE: Final = "base"
 SIZES_KEY: Final = "sizes"
 #: Keys whose mappings are merged key by key; all other values are replaced.
 MERGED: Final = ("env_kwargs", "policy_kwargs")
+#: Two words for one setting, of which the later one counts.
+EITHER: Final = {"batch_size": "n_minibatches", "n_minibatches": "batch_size"}
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -135,4 +137,6 @@ def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in layer.items():
             both = key in MERGED and isinstance(result.get(key), Mapping) and isinstance(value, Mapping)
             result[key] = {**result[key], **value} if both else value
+            if key in EITHER and value is not None and layer.get(EITHER[key]) is None:
+                result.pop(EITHER[key], None)
     return result
