@@ -16,7 +16,7 @@ from typing import Any
 
 from hecogrid_envs import TASK_NAMES
 from sb3_saf import EvaluationResult, RandomPolicy, evaluate_team, replay
-from sb3_saf.teams.checks import evaluation_seed
+from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.training.enjoy import Film, write_video
 from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import python_command, read_curve, write_run
@@ -69,6 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     level = {"coordination": options.coordination, "heterogeneity": options.heterogeneity}
     try:
+        check_seed(options.seed)
         settings = load_settings("saf", f"{options.task}-v0", "small", level, {"game_steps": options.game_steps})
     except ValueError as error:
         parser.error(str(error))

@@ -25,7 +25,7 @@ from hecogrid_envs.tasks import TASKS
 from sb3_saf import CheckpointError, make_vec_env
 from sb3_saf.envs import game_copies
 from sb3_saf.envs.supersuit_vec_env import SuperSuitVecEnv
-from tests.toy_envs import CounterEnv, GlobalEnv, LazyEnv, OuterWrapper, StateEnv, UnpicklableEnv
+from tests.toy_envs import CounterEnv, Game, GlobalEnv, LazyEnv, OuterWrapper, StateEnv, UnpicklableEnv
 
 
 class MaskedChoicesEnv(CounterEnv):
@@ -135,6 +135,26 @@ def test_games_that_share_what_changes_are_not_copied_one_by_one() -> None:
     venv.reset()
     with pytest.raises(CheckpointError, match="games share an object that changes"):
         venv.checkpoint_state()
+
+
+class ResetEnv(Game):
+    """Has a state from its first reset on, as PettingZoo's games."""
+
+    def get_state(self) -> dict[str, Any]:
+        return {"t": self.t}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        self.reset()
+        self.t = state["t"]
+
+
+@pytest.mark.parametrize("n_cpus", [1, 2])
+def test_games_before_their_first_reset_have_no_state(n_cpus: int) -> None:
+    venv = SuperSuitVecEnv(ResetEnv, 2, n_cpus=n_cpus, seed=0)
+    assert venv.checkpoint_state()["games"] == []
+    venv.reset()
+    assert [game["state"] for game in venv.checkpoint_state()["games"]] == [{"t": 0}] * 2
+    venv.close()
 
 
 def test_a_slow_game_is_tried_for_fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:

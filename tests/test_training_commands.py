@@ -391,3 +391,6 @@ def test_wrong_levels_of_make_train_are_named(tmp_path: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit, match="2"):
         quickstart.main(["--coordination", "6", "--output", str(tmp_path)])
     assert "coordination must be an integer from 1 to 5" in capsys.readouterr().err.splitlines()[-1]
+    with pytest.raises(SystemExit, match="2"):
+        quickstart.main(["--seed", "-1", "--output", str(tmp_path)])
+    assert "seed" in capsys.readouterr().err.splitlines()[-1] and not list(tmp_path.iterdir())

@@ -223,6 +223,11 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     zoo_plot.main(["-f", str(tmp_path), "--source", "training", "-o", figure])
     told = capsys.readouterr().err
     assert told.count("left out: ") == 1 and "4" in told  # the run without episodes
+    fake_run(tmp_path, 6, seed=3)
+    (tmp_path / "saf" / f"{ENV}_6" / "curve.csv").write_text("game_steps,processor_seconds,score,episodes\n")
+    zoo_plot.main(["-f", str(tmp_path), "--source", "training", "-o", figure])
+    assert f"left out: no episode has ended in {tmp_path}/saf/{ENV}_6" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "saf" / f"{ENV}_6")
     (tmp_path / "saf" / f"{ENV}_1" / "finished.json").rename(tmp_path / "kept")
     shutil.copytree(tmp_path / "saf" / f"{ENV}_1", tmp_path / "saf" / f"{ENV}_5")
     (tmp_path / "kept").rename(tmp_path / "saf" / f"{ENV}_1" / "finished.json")

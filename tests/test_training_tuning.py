@@ -66,7 +66,7 @@ def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path:
 def test_trials_are_evaluated_n_times_in_game_steps(tmp_path: Path) -> None:
     study = tune(tmp_path, "--n-evaluations", "4", "--pruner", "none", "-n", "160")
     (trial,) = study.trials
-    assert trial.state is TrialState.COMPLETE
+    assert trial.state is TrialState.COMPLETE and trial.user_attrs == {"seed": 3}
     assert sorted(trial.intermediate_values) == [1, 2, 3, 4]
     assert trial.value == trial.intermediate_values[4]
     assert not list((tmp_path / "logs").glob(f"saf/{ENV}_*"))  # no run folder is left
@@ -111,6 +111,25 @@ def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Pa
         assert saved["learning_rate"] == sampled["learning_rate"]
     zoo_train.main([*SMOKE, *options, "--trial-id", "0", "-params", "learning_rate:0.5"])
     assert Run(tmp_path / "logs" / "saf" / f"{ENV}_3").settings.plain["learning_rate"] == 0.5
+
+
+def test_ctrl_c_reports_the_trials_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evaluate, begun = SeededEvalCallback._evaluate, []
+
+    def interrupted(callback: SeededEvalCallback) -> bool:
+        begun.append(callback)
+        if len(begun) == 2:
+            raise KeyboardInterrupt
+        return evaluate(callback)
+
+    monkeypatch.setattr(SeededEvalCallback, "_evaluate", interrupted)
+    study = tune(tmp_path, "--n-trials", "3", "--n-evaluations", "1")
+    assert "Best: trial 0" in capsys.readouterr().out and len(study.trials) == 2
+    assert list((tmp_path / "logs").glob("saf/report_*.csv"))
+    trial = ["--storage", str(tmp_path / "study.log"), "--study-name", "s", "--trial-id", "1", "-f", str(tmp_path)]
+    assert "trial 1 of 's' failed or is not finished" in failed([*SMOKE, *trial], capsys)
 
 
 def test_unknown_studies_and_trials_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

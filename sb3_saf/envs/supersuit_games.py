@@ -374,11 +374,11 @@ class TeamConcatVecEnv(ConcatVecEnv):
         own = zip(self._indices, self.vec_envs, strict=True)
         return {index: function(game.par_env, *args) for index, game in own if index in asked}
 
-    def snapshots(self) -> list[dict[str, Any]]:
-        """Copy the games of this process; raise CheckpointError if they cannot be copied."""
+    def snapshots(self, begun: bool) -> list[dict[str, Any]]:
+        """Copy the games of this process, none before their first reset; CheckpointError if they cannot be copied."""
         if self._way is None:
             self._way = find_way(self._new_game)
-        return [game.snapshot(self._way) for game in self.vec_envs]
+        return [game.snapshot(self._way) for game in self.vec_envs] if begun else []
 
     def restore(self, snapshots: Sequence[Mapping[str, Any]]) -> None:
         """Restore the games of this process from snapshots of all E games."""

@@ -203,7 +203,7 @@ class SuperSuitVecEnv(TeamVecEnv):
     def checkpoint_state(self) -> dict[str, Any]:
         """Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`)."""
         self._check_open()
-        snapshots = [snapshot for some in self._games.run("snapshots") for snapshot in some]
+        snapshots = [snapshot for some in self._games.run("snapshots", self._begun) for snapshot in some]
         for snapshot in snapshots:
             if "pickled" in snapshot:
                 snapshot["signature"] = signature(snapshot["pickled"])
@@ -212,7 +212,7 @@ class SuperSuitVecEnv(TeamVecEnv):
             "next_seeds": self._seeds_of_games(),
             "begun": self._begun,
             "warned": self._has_warned,
-            "games": snapshots if self._begun else [],
+            "games": snapshots,
         }
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:

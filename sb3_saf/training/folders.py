@@ -171,10 +171,13 @@ class Run:
 
         :return: columns ``game_steps`` and ``score``; for training also ``episodes``, and ``processor_seconds`` of a
             finished run
-        :raises ValueError: if there is none
+        :raises ValueError: if there is none, or it has no point
         """
         if source == "training":
-            return read_curve(self.folder)
+            curve = read_curve(self.folder)
+            if curve.empty:
+                raise ValueError(f"no episode has ended in {self.folder}; train longer")
+            return curve
         import pandas as pd
 
         path = self.folder / "evaluations.npz"

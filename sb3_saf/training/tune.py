@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -179,9 +179,10 @@ def optimize(
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
         study.set_user_attr("goal", goal)
-    study.optimize(
-        lambda trial: run_trial(trial, settings_of(trial), tuning), n_trials=tuning.n_trials, gc_after_trial=True
-    )
+    with suppress(KeyboardInterrupt):  # the trials before are reported
+        study.optimize(
+            lambda trial: run_trial(trial, settings_of(trial), tuning), n_trials=tuning.n_trials, gc_after_trial=True
+        )
     trials = study.get_trials(deepcopy=False)
     if all(trial.state is not TrialState.COMPLETE for trial in trials):
         why = [trial.user_attrs[_ERROR] for trial in trials if _ERROR in trial.user_attrs]
@@ -196,6 +197,7 @@ def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:
     :raises optuna.TrialPruned: if the pruner stops it, training fails, or the value is not finite
     """
     seed = (tuning.seed + trial.number) % (MAX_SEED + 1)
+    trial.set_user_attr("seed", seed)
     options = replace(
         tuning.options,
         eval_freq=max(1, settings.game_steps // tuning.n_evaluations),
@@ -252,7 +254,7 @@ def trial_overrides(storage: str, study_name: str, number: int | None) -> dict[s
     opened = open_storage(storage, must_exist=True)
     try:
         study = optuna.load_study(study_name=study_name, storage=opened)
-        return to_overrides((study.best_trial if number is None else study.trials[number]).params)
+        trial = study.best_trial if number is None else study.trials[number]
     except IndexError:
         raise ValueError(f"the study {study_name!r} has no trial {number}; take a smaller --trial-id") from None
     except (KeyError, ValueError):
@@ -260,3 +262,6 @@ def trial_overrides(storage: str, study_name: str, number: int | None) -> dict[s
             f"there is no study {study_name!r} in {storage}, or none of its trials is complete; give the "
             "--study-name and --storage of the tuning"
         ) from None
+    if trial.state not in (TrialState.COMPLETE, TrialState.PRUNED):
+        raise ValueError(f"trial {trial.number} of {study_name!r} failed or is not finished; take another --trial-id")
+    return to_overrides(trial.params)
