@@ -277,6 +277,9 @@ def test_marl_eval_gets_means_over_the_episodes_of_complete_runs(folder: Path) -
     own = frames.curves.query("method == 'saf' and task == 'TeamSupport' and level == 'c1-h1' and seed == 1")["score"]
     assert list(run) == ["step_0", "absolute_metrics"] and run["step_0"]["step_count"] == 60
     assert run["step_0"]["return"] == [pytest.approx(own.mean())]  # half way between 40 and 80
+    longer = seldom.assign(game_steps=seldom["game_steps"].where(seldom["level"] == "c1-h1", 10 * seldom["game_steps"]))
+    run = marl_eval(Frames(frames.tests, longer), "x")["x"]["teamsupport_c2_h1"]["ippo"]["seed_1"]
+    assert list(run) == ["step_0", "absolute_metrics"] and run["step_0"]["step_count"] == 600
     lacking = Frames(frames.tests[(frames.tests["method"] != "ippo") | (frames.tests["seed"] == 0)], frames.curves)
     assert list(marl_eval(lacking, "x")["x"]["teamsupport_c1_h1"]["saf"]) == ["seed_0"]
 

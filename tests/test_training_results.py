@@ -301,18 +301,19 @@ def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: 
     assert set(describe(find_runs(tmp_path))["method"]) == {"mappo", expected[1]}  # beside another method, too
 
 
-def sized_game(size: int) -> CounterEnv:
-    """Make a game of a parameter that is named as a column of the table."""
+def sized_game(size: int, method: str = "") -> CounterEnv:
+    """Make a game of parameters that are named as columns of the table."""
     return CounterEnv(max_cycles=size)
 
 
 def test_a_parameter_of_a_game_may_be_named_as_a_column(tmp_path: Path) -> None:
     sizes: list[Size] = ["small", "smoke"]
     for number, size in enumerate(sizes, start=1):
-        settings = load_settings("saf", f"{__name__}:sized_game", size, {"size": 8})
+        settings = load_settings("saf", f"{__name__}:sized_game", size, {"size": 8, "method": "a"})
         write_run(tmp_path / "saf" / f"Sized_{number}", settings.as_dict(), 0, "")
     table = describe(find_runs(tmp_path))
     assert sorted(table["size"]) == sizes and set(table["size of the game"]) == {8}
+    assert set(table["method"]) == {"saf"} and set(table["method of the game"]) == {"a"}
 
 
 def test_runs_of_games_that_are_not_registered_are_found_by_others_names(

@@ -76,6 +76,7 @@ def test_the_time_of_evaluations_is_that_of_all_parts(
     load = SeededEvalCallback.load_checkpoint_state
 
     def load_more(callback: SeededEvalCallback, state: dict[str, Any]) -> None:
+        assert state["seconds"] > 0
         load(callback, {**state, "seconds": state["seconds"] + 1e6})
 
     monkeypatch.setattr(SeededEvalCallback, "load_checkpoint_state", load_more)

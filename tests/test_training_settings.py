@@ -249,8 +249,13 @@ def test_the_later_of_batch_size_and_n_minibatches_counts(tmp_path: Path) -> Non
     for given, expected in (({}, 500), ({"n_minibatches": 4}, 1000), ({"batch_size": 250}, 250)):
         assert load_settings("mappo", ENV, overrides=given, config=config).hyperparams["batch_size"] == expected
     config.write_text("default: {n_envs: 4, n_steps: 10, batch_size: 20, n_minibatches: 2}", encoding="utf-8")
-    with pytest.raises(ValueError, match=r"own\.yml: batch_size and n_minibatches say the same thing"):
+    both = "batch_size and n_minibatches say the same thing"
+    with pytest.raises(ValueError, match=rf"own\.yml: the entry 'default': {both}"):
         load_settings("mappo", ENV, config=config)
+    with pytest.raises(ValueError, match=both):
+        load_settings("mappo", ENV, overrides={"batch_size": 500, "n_minibatches": 2})
+    with pytest.raises(ValueError, match="n_minibatches divides rollouts of n_steps; A2C has no parts of them"):
+        load_settings("mappo", ENV, overrides={"algorithm": "A2C", "n_minibatches": 2})
 
 
 def test_maskable_ppo_takes_no_normalised_values_from_a_file(tmp_path: Path) -> None:

@@ -125,8 +125,9 @@ def test_ctrl_c_reports_the_trials_before(
         return evaluate(callback)
 
     monkeypatch.setattr(SeededEvalCallback, "_evaluate", interrupted)
-    study = tune(tmp_path, "--n-trials", "3", "--n-evaluations", "1")
-    assert "Best: trial 0" in capsys.readouterr().out and len(study.trials) == 2
+    with pytest.raises(SystemExit, match="130"):
+        tune(tmp_path, "--n-trials", "3", "--n-evaluations", "1")
+    assert "Best: trial 0" in capsys.readouterr().out and len(load_study(str(tmp_path / "study.log")).trials) == 2
     assert list((tmp_path / "logs").glob("saf/report_*.csv"))
     trial = ["--storage", str(tmp_path / "study.log"), "--study-name", "s", "--trial-id", "1", "-f", str(tmp_path)]
     assert "trial 1 of 's' failed or is not finished" in failed([*SMOKE, *trial], capsys)

@@ -332,24 +332,30 @@ def marl_eval(frames: Frames, environment: str) -> dict[str, Any]:
     Return results in the format of marl-eval: environment, task, algorithm, run, step, metrics.
 
     Its functions compare complete data only: settings and seeds that every method has, with as many evaluations. These
-    are at the game steps of the fewest ones, interpolated where others differ.
+    are at those game steps of the setting's shortest curve that all its runs have reached, interpolated where others
+    differ.
     Absolute metrics are means over the test episodes of a run; ``score`` is normalised by the largest return.
     """
     tests = _scored(frames.tests).query("train_level == level and game_steps > 0")
     tests = complete(tests.assign(stratum=tests["task"] + " " + tests["level"]))
     curves = dict(list(frames.curves.groupby(["method", "task", "level", "seed"]))) if len(frames.curves) else {}
-    at = min(curves.values(), key=len)["game_steps"].sort_values() if curves else []
     content: dict[str, Any] = {}
-    for row in tests.itertuples(index=False):
-        curve = curves[row.method, row.task, row.train_level, row.seed].sort_values("game_steps")
-        values = np.interp(at, curve["game_steps"], curve["score"]).tolist()
-        steps: dict[str, Any] = {
-            f"step_{index}": {"step_count": int(step), "return": [value], "score": [(value - row.low) / row.span]}
-            for index, (step, value) in enumerate(zip(at, values, strict=True))
-        }
-        steps["absolute_metrics"] = {"return": [row.return_mean], "score": [row.score]}
-        task = f"{row.task}_{row.level}".lower().replace("-", "_")
-        content.setdefault(task, {}).setdefault(row.method.replace("-", "_"), {})[f"seed_{row.seed}"] = steps
+    for (task, level), rows in tests.groupby(["task", "level"], sort=False):
+        runs = zip(rows["method"], rows["task"], rows["train_level"], rows["seed"], strict=True)
+        own = [curves[run].sort_values("game_steps") for run in runs]
+        at = min((curve["game_steps"] for curve in own), key=len)
+        at = at[
+            at.between(max(curve["game_steps"].min() for curve in own), min(curve["game_steps"].max() for curve in own))
+        ]
+        for row, curve in zip(rows.itertuples(index=False), own, strict=True):
+            values = np.interp(at, curve["game_steps"], curve["score"]).tolist()
+            steps: dict[str, Any] = {
+                f"step_{index}": {"step_count": int(step), "return": [value], "score": [(value - row.low) / row.span]}
+                for index, (step, value) in enumerate(zip(at, values, strict=True))
+            }
+            steps["absolute_metrics"] = {"return": [row.return_mean], "score": [row.score]}
+            of_task = content.setdefault(f"{task}_{level}".lower().replace("-", "_"), {})
+            of_task.setdefault(row.method.replace("-", "_"), {})[f"seed_{row.seed}"] = steps
     return {environment: content}
 
 

@@ -113,7 +113,7 @@ def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str
     found: dict[str, list[Run]] = {}
     for path in sorted(folder.glob(f"*/*/{RUN_FILE}")):
         run = Run(path.parent)
-        if not names or folder_name(run.description["settings"]["env"]) in names:
+        if not names or folder_name(str(run.description["settings"].get("env"))) in names:
             found.setdefault(path.parts[-3], []).append(run)
     if not found:
         of = f" of {', '.join(env_ids)}" if env_ids else ""
@@ -158,7 +158,8 @@ def describe(runs: Sequence[Run]) -> pd.DataFrame:
             method = f"{kind[0]}, variant {numbers.setdefault(changes, len(numbers) + 1)}"
         identity = {"env": run.settings.env_id, "size": run.settings.size, "seed": run.seed}
         level = {**stated[run.settings.env_id], **run.settings.env_kwargs}
-        level = {f"{name} of the game" if name in identity else name: value for name, value in level.items()}
+        taken = {*identity, "run", "changes", "method"}
+        level = {f"{name} of the game" if name in taken else name: value for name, value in level.items()}
         rows.append({**identity, **level, "run": run, "changes": changes, "method": method})
     table = pd.DataFrame(rows)
     is_finished = np.array([(run.folder / FINISHED).is_file() for run in runs])

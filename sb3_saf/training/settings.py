@@ -47,7 +47,7 @@ from sb3_saf.teams.checks import check_seed, evaluation_seed, unknown_name
 from sb3_saf.teams.rows import TeamSpaces
 from sb3_saf.teams.vec_env import require_n_agents, shares_reward
 from sb3_saf.training.wrappers import WRAPPER_KEYS, stages_of, wrap_game, wrap_rows
-from sb3_saf.training.yaml_files import DEFAULT, SIZES, Size, entry_of, merge, read_settings
+from sb3_saf.training.yaml_files import DEFAULT, SIZES, Size, check_either, entry_of, merge, read_settings
 
 #: Methods by their names on the command line, in log folders and YAML files.
 ALGOS: Final[dict[str, AlgorithmSpec]] = COMMANDS
@@ -326,8 +326,7 @@ def _checked(entry: Mapping[str, Any], method: AlgorithmSpec, spec: AlgorithmSpe
         if "game_steps" in entry:
             raise ValueError(f"{source}: game_steps and n_timesteps say the same thing; give one of them")
         entry["game_steps"] = entry.pop("n_timesteps")
-    if entry.get("batch_size") is not None and entry.get("n_minibatches") is not None:
-        raise ValueError(f"{source}: batch_size and n_minibatches say the same thing; give one of them")
+    check_either(entry, source)
     if (policy := entry.pop("policy", spec.policy)) != spec.policy:
         raise ValueError(f"{source}: policy={policy!r} is not a setting here; --algo names the policy ({spec.policy})")
     known = {**_OWN_KEYS, **algorithm_arguments(method.algorithm), **algorithm_arguments(spec.algorithm)}
@@ -372,8 +371,10 @@ def _build(
     hints = algorithm_arguments(spec.algorithm)
     plain = {key: value for key, value in entry.items() if key in hints}
     if "n_minibatches" in own:
-        if plain.get("n_steps") is None:
-            raise ValueError(f"n_minibatches divides a rollout of n_steps; {spec.algorithm.__name__} has none")
+        if plain.get("n_steps") is None or "batch_size" not in hints:
+            raise ValueError(
+                f"n_minibatches divides rollouts of n_steps; {spec.algorithm.__name__} has no parts of them"
+            )
         # Whole teams: one team is the rows of one game at one step.
         plain["batch_size"] = -(-convert("n_steps", plain["n_steps"], int) * n_envs // own["n_minibatches"]) * n_agents
     hyperparams = {key: convert(key, value, hints[key]) for key, value in plain.items()}

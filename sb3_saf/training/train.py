@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import yaml
 
@@ -36,6 +36,9 @@ from sb3_saf.training.folders import RUN_FILE, find_unfinished, make_run_folder,
 from sb3_saf.training.run import ProgressLines, RunOptions, Training
 from sb3_saf.training.settings import ALGOS, Settings, load_settings
 from sb3_saf.training.yaml_files import SIZES, merge
+
+if TYPE_CHECKING:
+    import optuna
 
 PROGRAM: Final = "python -m sb3_saf.train"
 #: Options that affect a run's results but are not in its settings.
@@ -335,7 +338,7 @@ def _track(options: argparse.Namespace, settings: Settings, seed: int) -> None:
 def _tune(options: argparse.Namespace, command: str) -> None:
     """Run trials, print the best one, and write all of them to ``report_*.csv``."""
     require("optuna", "pandas")
-    from sb3_saf.training.tune import Tuning, optimize, sample_overrides
+    from sb3_saf.training.tune import Tuning, is_any_complete, open_study, optimize, sample_overrides
 
     with user_errors():
         settings, eval_settings = _settings(options)
@@ -352,19 +355,24 @@ def _tune(options: argparse.Namespace, command: str) -> None:
     beginning = None if options.trained_agent is None else digest(options.trained_agent)
     goal = plain({**settings.as_dict(), **evaluated, "initial_model": beginning})
     print(f"Tuning {settings.algo} on {settings.env_id}: {settings.game_steps:,} game steps a trial")
+
+    def settings_of(trial: optuna.Trial) -> Settings:
+        sampled = sample_overrides(trial, settings.spec, _fixed(options), with_shapes=beginning is None)
+        return _settings(options, sampled)[0]
+
     with user_errors():
-        study = optimize(
-            lambda trial: _settings(
-                options, sample_overrides(trial, settings.spec, _fixed(options), with_shapes=beginning is None)
-            )[0],
-            tuning,
-            command,
-            goal,
-        )
-        report = f"report_{settings.environment.folder_name}_{int(time.time())}.csv"
-        path = options.log_folder / settings.algo / report
-        write_text(path, study.trials_dataframe().to_csv())
-        best = study.best_trial
+        study = open_study(tuning, command, goal)
+        try:
+            optimize(study, settings_of, tuning)
+        finally:  # also of trials before an interruption
+            if is_any_complete(study):
+                report = f"report_{settings.environment.folder_name}_{int(time.time())}.csv"
+                _write_report(study, options.log_folder / settings.algo / report)
+
+
+def _write_report(study: optuna.Study, path: Path) -> None:
+    write_text(path, study.trials_dataframe().to_csv())
+    best = study.best_trial
     print(f"{len(study.trials)} trials, in {path}\nBest: trial {best.number} with a team return of {best.value:.2f}")
     for key, value in best.params.items():
         print(f"    {key}: {value}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -144,14 +144,12 @@ class Tuning:
     n_evaluations: int = 5
 
 
-def optimize(
-    settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning, command: str, goal: Mapping[str, Any]
-) -> optuna.Study:
+def open_study(tuning: Tuning, command: str, goal: Mapping[str, Any]) -> optuna.Study:
     """
-    Run trials and return the study.
+    Make the study, or open that of the storage.
 
     :param goal: what is tuned on what, for how long; the trials of one study are of one goal
-    :raises ValueError: if the study's trials are of another goal, or none of them was completed
+    :raises ValueError: if the study's trials are of another goal
     """
     pruner: optuna.pruners.BasePruner = optuna.pruners.NopPruner()
     if tuning.pruner == "halving":
@@ -179,15 +177,23 @@ def optimize(
     if "command" not in study.user_attrs:
         study.set_user_attr("command", command)
         study.set_user_attr("goal", goal)
-    with suppress(KeyboardInterrupt):  # the trials before are reported
-        study.optimize(
-            lambda trial: run_trial(trial, settings_of(trial), tuning), n_trials=tuning.n_trials, gc_after_trial=True
-        )
-    trials = study.get_trials(deepcopy=False)
-    if all(trial.state is not TrialState.COMPLETE for trial in trials):
+    return study
+
+
+def optimize(study: optuna.Study, settings_of: Callable[[optuna.Trial], Settings], tuning: Tuning) -> None:
+    """Run trials; the ValueError if none of the study's was completed contains the last error."""
+    study.optimize(
+        lambda trial: run_trial(trial, settings_of(trial), tuning), n_trials=tuning.n_trials, gc_after_trial=True
+    )
+    if not is_any_complete(study):
+        trials = study.get_trials(deepcopy=False)
         why = [trial.user_attrs[_ERROR] for trial in trials if _ERROR in trial.user_attrs]
         raise ValueError(f"none of {len(trials)} trials was completed{f'; the last error: {why[-1]}' if why else ''}")
-    return study
+
+
+def is_any_complete(study: optuna.Study) -> bool:
+    """Return whether the study has a best trial."""
+    return bool(study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]))
 
 
 def run_trial(trial: optuna.Trial, settings: Settings, tuning: Tuning) -> float:

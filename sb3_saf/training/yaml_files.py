@@ -94,6 +94,8 @@ def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[st
         for size in sections:
             if size not in SIZES:
                 raise ValueError(f"{what}: {unknown_name('size', size, SIZES)}")
+        for layer in (entry, *sections.values()):
+            check_either(layer, what)
     if base is None:
         return content
     others = [name for name in config_names() if name not in refined_by]
@@ -128,6 +130,12 @@ def entry_of(content: Mapping[str, Any], keys: Sequence[str], size: Size) -> dic
     entries = [dict(content.get(key, {})) for key in keys]
     sections = [entry.pop(SIZES_KEY, {}).get(size, {}) for entry in entries]
     return merge(*entries, *sections)
+
+
+def check_either(layer: Mapping[str, Any], source: str) -> None:
+    """Check that settings have one word only of ``EITHER``; the ValueError names their ``source``."""
+    if all(layer.get(word) is not None for word in EITHER):
+        raise ValueError(f"{source}: {' and '.join(EITHER)} say the same thing; give one of them")
 
 
 def merge(*layers: Mapping[str, Any]) -> dict[str, Any]:
