@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from inspect import signature
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +41,8 @@ State = tuple[npt.NDArray[Any], ...] | None
 EvaluationCallback = Callable[[dict[str, Any], dict[str, Any]], None]
 #: Returns the actions (B, ...) of all rows, from their observations and whether an episode starts, (B,).
 Act = Callable[[Any, npt.NDArray[np.bool_]], Array]
+#: Steps of one game after which a warning says that it may never end.
+_LONG: Final = 10_000
 
 
 class Interval(NamedTuple):
@@ -267,13 +269,21 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
     n_games = env.num_envs // n_agents
     remaining = (n_episodes + np.arange(n_games)) // n_games
     observations: Any = env.reset()
-    starts = np.ones(env.num_envs, dtype=np.bool_)
+    starts, lengths = np.ones(env.num_envs, dtype=np.bool_), np.zeros(n_games, dtype=np.int64)
     try:
         while remaining.any():
             actions = act(observations, starts)
             following, rewards, row_dones, infos = env.step(actions)
             dones = np.asarray(row_dones, dtype=np.bool_)
             ended = team_dones(dones, n_agents, alone=True)
+            lengths = np.where(ended, 0, lengths + 1)
+            if lengths.max() == _LONG:
+                warnings.warn(
+                    f"a game has not ended in {_LONG:,} steps; if it never ends, give it a time limit, and if the most "
+                    "likely actions lead nowhere, evaluate with deterministic=False",
+                    UserWarning,
+                    stacklevel=3,
+                )
             yield PlayedStep(observations, actions, following, rewards, dones, infos, ended, remaining > 0)
             whole = [ended[game] and STAGGERED not in infos[game * n_agents] for game in range(n_games)]
             remaining = np.maximum(remaining - whole, 0)

@@ -279,6 +279,13 @@ class TestIntervals:
             confidence_interval([1, 2], 95)
 
 
+def test_games_that_may_never_end_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_saf.evaluation._LONG", 3)
+    env = make_team_env(partial(CounterEnv, max_cycles=5), 1, seed=0)
+    with pytest.warns(UserWarning, match="a game has not ended in 3 steps; if it never ends, give it a time limit"):
+        evaluate_team(RandomPolicy(env, seed=0), env, 1)
+
+
 class TestRandomPolicy:
     @pytest.mark.parametrize(
         ("space", "sizes"),

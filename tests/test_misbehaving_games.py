@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,7 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 
 from sb3_saf import TeamRolloutBuffer, check_team_env, make_team_env
-from tests.toy_envs import CounterEnv, TellingEnv
+from tests.toy_envs import CounterEnv, Game, TellingEnv
 
 #: Changes what a step returns: observations, rewards, terminations, truncations and infos by agent.
 Fault = Callable[[CounterEnv, list[Any]], Any]
@@ -122,8 +123,8 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     (gives(REWARD, np.ones(2)), "the reward of agent_1 in step 2"),
     (gives(REWARD, np.nan), "the reward of agent_1 in step 2 of a trial episode, got nan"),
     (replaces(REWARD, np.ones(2)), f"{STEP}, as PettingZoo 1.24 and later do, got 5 values: dict, ndarray"),
-    (lacks(OBSERVATION), "an observation for agent_1, which takes part, in step 2"),
-    (gives(OBSERVATION, None), "an observation for agent_1, which takes part, in step 2"),
+    (lacks(OBSERVATION), "an observation for agent_1, which takes part or has just been truncated, in step 2"),
+    (gives(OBSERVATION, None), "an observation for agent_1, which takes part or has just been truncated, in step 2"),
     (gives(OBSERVATION, np.zeros(4)), "agent_1 in step 2 of a trial episode: expected float32 of shape (3,), got"),
     (gives(OBSERVATION, [1, [2], [3, 4]]), "agent_1 in step 2 of a trial episode: expected float32 of shape (3,)"),
     (gives(OBSERVATION, [0, np.nan, 0]), "agent_1 in step 2 of a trial episode: expected finite values, got nan"),
@@ -148,7 +149,7 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"at_reset": lambda env, result: (result[0], [])}, f"{RESET}, as PettingZoo 1.24 and later do, got 2 values"),
     ({"at_reset": lists()}, "expected at least one name in agents of counter_v0 after reset, got none"),
     ({"at_reset": lists("left")}, "in agents of counter_v0 at the reset of a trial episode, got 'left'"),
-    ({"at_reset": lambda env, result: result[0].clear()}, "an observation for agent_0, which takes part, at the reset"),
+    ({"at_reset": lambda env, result: result[0].clear()}, "an observation for agent_0, which takes part"),
     ({"at_reset": lambda env, result: result[1].update(agent_0="new")}, "a dict as the info of agent_0 at the reset"),
     ({"setup": set_to("reset", lambda: None)}, "expected counter_v0 to have reset(seed=None, options=None)"),
     ({"setup": set_to("possible_agents", ["a", "b", "a"])}, "got 'a' more than once in ['a', 'b', 'a']"),
@@ -156,6 +157,9 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"setup": set_to("observation_space", {})}, "expected observation_space(agent) to be a method"),
     ({"at_step": lambda env, result: env.possible_agents.pop() and None}, "removes agents from both: write"),
     ({"space": spaces.Box(0, 1, (0,))}, "expected an observation space with at least one entry"),
+    ({"space": spaces.Box(0, 1, ())}, "expected an observation space with an axis, got Box(0.0, 1.0, (), float32)"),
+    ({"at_step": lambda env, result: result[3].update(agent_0=True) or result[0].clear()},
+     "an observation for agent_0, which takes part or has just been truncated, in step 2"),
     ({"space": spaces.Text(3)}, "expected an observation space that is one of Discrete, MultiDiscrete, MultiBinary"),
     ({"action_space": spaces.Tuple([spaces.Discrete(2)])}, "expected an action space that is one of Discrete"),
 ]  # fmt: skip
@@ -169,6 +173,44 @@ def test_each_fault_is_named_when_the_environment_is_made(fault: dict[str, Any],
         make_team_env(MisbehavingEnv, 2, seed=0, unequal=unequal, **fault)
     with pytest.raises(ValueError, match=re.escape(message)):
         check_team_env(MisbehavingEnv(unequal=unequal, **fault))
+
+
+class KeysEnv(CounterEnv):
+    """Gives the names of its agents as the keys of a dict, by a property."""
+
+    @property
+    def possible_agents(self) -> Any:
+        return dict.fromkeys(["agent_0", "agent_1"]).keys()
+
+    @possible_agents.setter
+    def possible_agents(self, agents: Any) -> None:
+        if not isinstance(agents, list) or hasattr(self, "agents"):
+            raise AttributeError("no setter")
+
+
+def test_a_property_that_gives_no_list_is_named() -> None:
+    with pytest.raises(ValueError, match="got a property that returns dict_keys; let it return list"):
+        make_team_env(KeysEnv, 1, seed=0)
+
+
+class HelperEnv(Game):
+    """Has attributes of its own with the names of others: neither a wrapped game nor masks for sb3-contrib."""
+
+    def __init__(self) -> None:
+        self.env = "grid"
+
+    def action_masks(self, agent: str) -> Any:
+        raise AssertionError("called without its agent")
+
+
+def test_attributes_with_the_names_of_others_are_the_games_own() -> None:
+    check_team_env(HelperEnv())
+    env = make_team_env(HelperEnv, 2, seed=0)
+    env.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.step(np.zeros(env.num_envs, dtype=int))
+    assert not env.has_attr("action_masks") and env.get_attr("env")[0] == "grid"
 
 
 #: Faults that come after the trial, and words of their errors.

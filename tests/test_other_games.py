@@ -926,6 +926,28 @@ class Leaver(Nim):
         self.agent_selection = self._deads_step_first()
 
 
+class OwnSums(Nim):
+    """Pays a stone for each move, and sums up by itself what ``last`` gives, without clearing what was paid."""
+
+    def step(self, action: int | None) -> None:
+        mover = self.agent_selection
+        self._cumulative_rewards[mover] = 0.0
+        super().step(action)
+        if mover in self.rewards and not any(self.terminations.values()):
+            self.rewards[mover] = 1.0
+            self._cumulative_rewards[mover] += 1.0
+
+
+def test_rewards_other_than_those_of_last_are_told() -> None:
+    env = TurnsInParallel(OwnSums())
+    env.reset(seed=0)
+    assert env.step(dict.fromkeys(env.agents, 0))[1] == {"first": 1.0, "second": 0.0}
+    with pytest.warns(
+        UserWarning, match=r"first is paid 2.0, .* but last\(\) of the game says 1.0: let its step clear"
+    ):
+        assert env.step(dict.fromkeys(env.agents, 0))[1] == {"first": 1.0, "second": 1.0}
+
+
 def test_the_next_player_sees_its_turn_after_one_that_is_skipped() -> None:
     env = TurnsInParallel(Leaver())
     env.reset(seed=0)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import deepcopy
 from math import isfinite, isnan
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import gymnasium as gym
 import numpy as np
@@ -163,6 +163,9 @@ class Trial:
                 listed = {*playing, *self._playing(ended)}
                 for name, flags in (("terminations", terminations), ("truncations", truncations)):
                     ended |= {agent for agent in listed if end_of(name, flags, agent, self._place)}
+                for agent in playing:
+                    if truncations.get(agent) and not terminations.get(agent):  # values may go on from there
+                        observation_of(observations, agent, self._place)
                 playing = self._playing(ended)
                 respawned = respawn_note(self.env, ended, terminations, truncations, self._place)
                 if respawned and not any(note.endswith(RESPAWNED) for note in self.notes):
@@ -250,7 +253,8 @@ class Trial:
             key, info = self.mask_keys[agent], infos.get(agent) or {}
             masks[agent] = mask_in(info) if key is None else observations[agent][key]
         if all(mask is None for mask in masks.values()):
-            shown = game_attribute(self.env, "action_masks")() if has_game_attribute(self.env, "action_masks") else {}
+            method = masks_method(self.env)
+            shown = {} if method is None else method()
             masks = {agent: shown.get(agent) if isinstance(shown, Mapping) else shown for agent in playing}
         return {agent: legal_sample(self.actions[agent], mask) for agent, mask in masks.items()}
 
@@ -300,7 +304,7 @@ def layers_of(env: Any) -> list[Any]:
         # Not getattr: PettingZoo's wrappers forward unknown names to the environment they wrap.
         own = getattr(layers[-1], "__dict__", {})
         inner = own.get("env", own.get("aec_env"))
-        if inner is None:
+        if not callable(getattr(inner, "reset", None)):  # an attribute of the game's own, or none
             break
         layers.append(inner)
     bare = getattr(env, "unwrapped", layers[-1])
@@ -353,6 +357,21 @@ def game_attribute(env: Any, name: str) -> Any:
     return getattr(env, name) if hasattr(env, name) else getattr(env.unwrapped, name)
 
 
+def masks_method(env: Any) -> Callable[[], Any] | None:
+    """Return the game's ``action_masks`` if it is what sb3-contrib calls: a method without arguments."""
+    method: Any = game_attribute(env, "action_masks") if has_game_attribute(env, "action_masks") else None
+    try:
+        inspect.signature(method).bind()
+    except (TypeError, ValueError):
+        return None
+    return cast("Callable[[], Any]", method)
+
+
+def has_masks_method(env: Any) -> bool:
+    """Return whether :func:`masks_method` has an answer."""
+    return masks_method(env) is not None
+
+
 def set_game_attribute(env: Any, name: str, value: Any) -> None:
     """Set an attribute on the outermost layer that has it itself, else on the bare game."""
     layers = layers_of(env)
@@ -385,7 +404,13 @@ def check_is_parallel(env: Any, is_factory: bool) -> None:
         )
     if not isinstance(env.possible_agents, (list, tuple)):
         bare = env.unwrapped if hasattr(env, "env") else env
-        bare.possible_agents = agents
+        try:
+            bare.possible_agents = agents
+        except AttributeError:
+            raise ValueError(
+                f"expected possible_agents of {env} to be a list, got a property that returns "
+                f"{type(env.possible_agents).__name__}; let it return list(...)"
+            ) from None
 
 
 def agents_of(env: Any) -> list[Any]:
@@ -423,6 +448,8 @@ def space_of(env: Any, kind: str, agent: Any) -> spaces.Space[Any]:
             f"expected an {kind} space with at least one entry, got {space} for {agent}; give agents without "
             f"{'anything to see' if kind == 'observation' else 'a choice'} one constant entry"
         )
+    if kind == "observation" and isinstance(space, spaces.Box) and not space.shape:
+        raise ValueError(f"expected an observation space with an axis, got {space} for {agent}; give it the shape (1,)")
     return space
 
 
@@ -488,8 +515,8 @@ def observation_of(observations: Mapping[Any, Any], agent: Any, place: str) -> A
     observation = observations.get(agent)
     if observation is None:
         raise ValueError(
-            f"expected an observation for {agent}, which takes part, {place}, got observations for "
-            f"{[name for name, value in observations.items() if value is not None]}"
+            f"expected an observation for {agent}, which takes part or has just been truncated, {place}, got "
+            f"observations for {[name for name, value in observations.items() if value is not None]}"
         )
     return observation
 

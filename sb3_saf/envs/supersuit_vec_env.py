@@ -238,7 +238,9 @@ class SuperSuitVecEnv(TeamVecEnv):
         return [row // self.n_agents for row in chosen_indices(rows, self.num_envs)]
 
     def has_attr(self, attr_name: str) -> bool:
-        """Return whether all games, or wrappers around them, have an attribute."""
+        """Return whether all games, or wrappers around them, have an attribute; a method if it is ``action_masks``."""
+        if attr_name == "action_masks":
+            return all(self._ask(range(self.n_games), audit.has_masks_method))
         return all(self._ask(range(self.n_games), audit.has_game_attribute, attr_name))
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:

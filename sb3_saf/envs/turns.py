@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -46,6 +48,8 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
             )
         super().__init__(turn_based_aec_to_parallel(env))
         self._aec = env
+        #: By agent: rewards since its last turn began; None after the warning that ``last`` gives others.
+        self._paid: Counter[Any] | None = Counter()
         self._n_actions: dict[Any, int] = {}
         for agent in env.possible_agents:
             space = env.action_space(agent)
@@ -56,17 +60,40 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin a game (see PettingZoo)."""
         observations, infos = super().reset(None if seed is None else seed % _SEEDS, options)
+        self._paid = None if self._paid is None else Counter()
         return self._with_masks(observations, infos)
 
     def step(self, actions: dict[Any, Any]) -> Any:
         """Play the move of the agent whose turn it is; actions of waiting agents are ignored."""
+        mover = self._aec.agent_selection
         observations, rewards, terminations, truncations, infos = super().step(actions)
+        self._check_paid(mover, rewards)
         if any(terminations.values()) or any(truncations.values()):
             # PettingZoo observes before the turns of agents that have ended, which are then skipped.
             observations = {**observations, **{agent: self._aec.observe(agent) for agent in self._aec.agents}}
             infos = {**infos, **{agent: self._aec.infos[agent] for agent in self._aec.agents}}
         observations, infos = self._with_masks(observations, infos)
         return observations, rewards, terminations, truncations, infos
+
+    def _check_paid(self, mover: Any, rewards: Mapping[Any, Any]) -> None:
+        """Warn once if the agent whose turn it is has been paid another sum than the game's ``last`` says."""
+        if self._paid is None:
+            return
+        self._paid[mover] = 0
+        self._paid.update(rewards)
+        agent = self._aec.agent_selection
+        if agent not in self._aec.agents:
+            return
+        owed = float(self._aec.last(observe=False)[1])
+        if not np.isclose(owed, self._paid[agent], rtol=1e-4, atol=1e-6):
+            warnings.warn(
+                f"{agent} is paid {float(self._paid[agent])}, the sum of the game's rewards since its last turn, but "
+                f"last() of the game says {owed}: let its step clear self.rewards, set them, and call "
+                "self._accumulate_rewards(), as PettingZoo's games do",
+                UserWarning,
+                stacklevel=2,
+            )
+            self._paid = None
 
     def _with_masks(
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any]
