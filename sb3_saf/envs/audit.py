@@ -8,6 +8,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from math import isfinite, isnan
 from typing import Any, Final, cast
@@ -360,10 +361,11 @@ def game_attribute(env: Any, name: str) -> Any:
 def masks_method(env: Any) -> Callable[[], Any] | None:
     """Return the game's ``action_masks`` if it is what sb3-contrib calls: a method without arguments."""
     method: Any = game_attribute(env, "action_masks") if has_game_attribute(env, "action_masks") else None
-    try:
-        inspect.signature(method).bind()
-    except (TypeError, ValueError):
-        return None
+    with suppress(ValueError):  # some compiled methods do not tell their arguments
+        try:
+            inspect.signature(method).bind()
+        except TypeError:
+            return None
     return cast("Callable[[], Any]", method)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -77,8 +78,8 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
 
     def _check_paid(self, mover: Any, rewards: Mapping[Any, Any]) -> None:
         """Warn once if the agent whose turn it is has been paid another sum than the game's ``last`` says."""
-        if self._paid is None:
-            return
+        if self._paid is None or not all(isinstance(reward, (Real, np.ndarray)) for reward in rewards.values()):
+            return  # what is no number is refused where rows are made
         self._paid[mover] = 0
         self._paid.update(rewards)
         agent = self._aec.agent_selection
