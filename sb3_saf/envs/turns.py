@@ -34,7 +34,8 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
 
         env = sb3_saf.make_team_env(lambda: sb3_saf.TurnsInParallel(hanabi_v5.env(colors=2, players=2)), n_envs=16)
 
-    Seeds are taken modulo 2^31. Rewards come at the step at which the game gives them, also to agents that wait.
+    Seeds are taken modulo 2^31. Rewards come at the step at which the game gives them, also to agents that wait; a
+    warning says if their sum until an agent's next turn is not what the game's ``last`` gives it then.
 
     :param env: an AECEnv whose agents act one after another, with Discrete actions
     :raises ValueError: if it is no AECEnv, or its actions are not Discrete
