@@ -340,6 +340,21 @@ def test_a_changed_test_is_not_taken_for_good_by_a_further_one(undisturbed: Path
     assert results.run(cell) is not None and results.missing_tests(cell) == cell.tests
 
 
+def test_the_log_of_a_cell_is_one_of_its_files(undisturbed: Path, tmp_path: Path) -> None:
+    """It says which resumptions were not exact."""
+    results = Results(shutil.copytree(undisturbed, tmp_path / "copy"))
+    cell = next(cell for cell in requested(EXPERIMENTS["joint"], results) if cell.id == CELL)
+    unfinished = results.unfinished(cell)
+    unfinished.mkdir(parents=True)
+    shutil.move(results.cell_folder(cell), unfinished / "result")
+    (unfinished / "log.txt").write_text("resumed from a damaged checkpoint\n")
+    results.publish(cell)
+    run = results.run(cell)
+    assert run is not None and run.damage("log.txt") is None
+    (run.folder / "log.txt").unlink()
+    assert run.damage("log.txt") is not None
+
+
 def test_a_worker_that_ends_without_results_has_failed(tmp_path: Path) -> None:
     summary, _ = run_inline(tmp_path, ONE, engine=InlineEngine(lambda folder: None))
     assert not summary.finished and [cell.method for cell in summary.failed] == ["ippo", RANDOM]

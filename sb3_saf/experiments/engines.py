@@ -188,7 +188,7 @@ class RayEngine(Engine):
                 raise RuntimeError(f"{error}{lost}")
             if (archive := answer.result()) is not None:
                 with zipfile.ZipFile(io.BytesIO(archive)) as packed:
-                    packed.extractall(folder / "result")
+                    packed.extractall(folder)
             done.set_result(None)
         except Exception as problem:
             done.set_exception(problem)
@@ -223,11 +223,11 @@ def _run_on_ray(name: str, inputs: dict[str, bytes]) -> bytes | None:
         if is_shared:
             return None
         log.flush()
-        result, buffer = folder / "result", io.BytesIO()
+        buffer = io.BytesIO()
         with zipfile.ZipFile(buffer, "w") as archive:  # models are compressed already
-            for path in sorted(path for path in result.rglob("*") if path.is_file()):
-                archive.write(path, path.relative_to(result).as_posix())
-            archive.write(folder / "log.txt", "log.txt")
+            for path in (folder / "log.txt", *sorted((folder / "result").rglob("*"))):
+                if path.is_file():
+                    archive.write(path, path.relative_to(folder))
         return buffer.getvalue()
 
 

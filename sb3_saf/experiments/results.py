@@ -238,9 +238,10 @@ class Results:
                 kept = self.folder / "damaged" / f"{cell.id}_{time.time_ns()}"
                 kept.parent.mkdir(parents=True, exist_ok=True)
                 os.replace(target, kept)
-            os.replace(result, target)
             if (log := self.unfinished(cell) / "log.txt").exists() and log.stat().st_size:  # warnings of resumptions
-                os.replace(log, target / log.name)
+                os.replace(log, result / log.name)
+                finish_run(result)
+            os.replace(result, target)
         folder = self.unfinished(cell)
         shutil.rmtree(folder, ignore_errors=True)
         for parent in folder.parents[: len(Path(cell.id).parts)]:
