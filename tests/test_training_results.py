@@ -28,7 +28,7 @@ from sb3_saf.training import enjoy as zoo_enjoy
 from sb3_saf.training import plot as zoo_plot
 from sb3_saf.training import train as zoo_train
 from sb3_saf.training.folders import Run, finish_run, training_curve, write_run
-from sb3_saf.training.plot import describe, find_runs, setting_names
+from sb3_saf.training.plot import describe, find_runs
 from sb3_saf.training.settings import load_settings
 from sb3_saf.training.yaml_files import Size
 from tests.test_training_commands import failed
@@ -183,11 +183,10 @@ def test_a_damaged_model_is_one_line(logs: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_runs_are_found_and_described(logs: Path) -> None:
-    table = describe(find_runs(logs, ["saf", "mappo"]))
-    found = sorted(zip(table["method"], table["seed"], table["coordination"], strict=True))
-    expected = [("saf", seed, c) for seed in (0, 1) for c in (1, 2)] + [("mappo", 0, c) for c in (1, 2)]
-    assert found == sorted(expected)
-    assert set(setting_names(table)) == {"TeamTogether, coordination 1", "TeamTogether, coordination 2"}
+    found = [(one.method, one.run.seed, one.setting) for one in describe(find_runs(logs, ["saf", "mappo"]))]
+    levels = "TeamTogether, coordination 1", "TeamTogether, coordination 2"
+    expected = [(method, seed, level) for method, seed in (("saf", 0), ("saf", 1), ("mappo", 0)) for level in levels]
+    assert sorted(found) == sorted(expected)
 
 
 def test_results_of_a_run(logs: Path) -> None:
@@ -213,11 +212,10 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     zoo_train.main(["--algo", "saf", *given])
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
-    table = describe(find_runs(tmp_path))
-    assert list(table["method"]) == ["saf", "saf gamma=0.9"]
-    assert [run.number for run in table["run"]] == [1, 3]
+    named = describe(find_runs(tmp_path))
+    assert [(one.run.number, one.method) for one in named] == [(1, "saf"), (3, "saf gamma=0.9")]
     with pytest.raises(ValueError, match="has no evaluations"):
-        table["run"][0].curve("evaluation")
+        named[0].run.curve("evaluation")
     fake_run(tmp_path, 4, seed=1)
     figure = str(tmp_path / "curves.png")
     zoo_plot.main(["-f", str(tmp_path), "--source", "training", "-o", figure])
@@ -237,7 +235,7 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     assert f"{ENV}_5 is not finished, others of its method are" in capsys.readouterr().err
     shutil.rmtree(tmp_path / "saf" / f"{ENV}_5")
     fake_run(tmp_path, 5, game_steps=40)  # as run 1, not finished
-    assert [run.number for run in describe(find_runs(tmp_path))["run"]] == [1, 3, 4]
+    assert [one.run.number for one in describe(find_runs(tmp_path))] == [1, 3, 4]
     assert "has no evaluations" in failed(["-f", str(tmp_path), "-o", figure], capsys, zoo_plot.main)
 
 
@@ -264,28 +262,30 @@ def test_names_of_methods_say_what_differs_from_the_zoo(tmp_path: Path) -> None:
     fake_run(tmp_path, 4, seed=1, **many)
     fake_run(tmp_path, 5, **{**many, "gamma": 0.8})
     fake_run(tmp_path, 6, time_limit="bootstrap")
-    table = describe(find_runs(tmp_path))
-    assert table["method"].iloc[-1] == "saf time_limit=bootstrap"
-    table = table.iloc[:-1]
-    assert list(table["method"]) == [
+    named = describe(find_runs(tmp_path))
+    assert [one.method for one in named] == [
         "saf",
         "saf batch_size=80 game_steps=80",
         *["saf, variant 1"] * 2,
         "saf, variant 2",
+        "saf time_limit=bootstrap",
     ]
-    assert table["changes"][2] == "ent_coef=0.02 gamma=0.9123456 n_policies=2 n_slots=3"
+    assert named[2].changes == "ent_coef=0.02 gamma=0.9123456 n_policies=2 n_slots=3"
     for number in (1, 2):
         fake_run(tmp_path / "shared", number, seed=number, game_steps=80)
-    assert list(describe(find_runs(tmp_path / "shared"))["method"]) == ["saf", "saf"]  # what all share is not named
+    assert methods_in(tmp_path / "shared") == ["saf", "saf"]  # what all share is not named
+
+
+def methods_in(folder: Path) -> list[str]:
+    return [one.method for one in describe(find_runs(folder))]
 
 
 def test_games_that_state_a_parameter_and_games_that_do_not_are_apart(tmp_path: Path) -> None:
     for number, stated in ((1, {}), (2, {"max_cycles": 7})):
         settings = load_settings("saf", "tests.toy_envs:CounterEnv", "smoke", {**stated, "deaths": {}})
         write_run(tmp_path / "saf" / f"Counter_{number}", settings.as_dict(), 0, "")
-    table = describe(find_runs(tmp_path))
-    assert table["max_cycles"].tolist() == ["default", 7]
-    assert [name.partition(", ")[2] for name in setting_names(table)] == ["max_cycles default", "max_cycles 7"]
+    settings_of_games = [one.setting.partition(", ")[2] for one in describe(find_runs(tmp_path))]
+    assert settings_of_games == ["max_cycles default", "max_cycles 7"]
 
 
 def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: Path) -> None:
@@ -293,27 +293,26 @@ def test_runs_that_began_or_were_evaluated_otherwise_have_other_names(tmp_path: 
     fake_run(tmp_path, 2, options={"deterministic_eval": True, "eval_env_kwargs": {"coordination": 3}})
     fake_run(tmp_path, 3, options={"initial_model": {"path": "old.zip", "sha256": "1"}})
     expected = ["saf", "saf deterministic_eval=True eval_env_kwargs=coordination:3", "saf trained_agent=old.zip"]
-    assert list(describe(find_runs(tmp_path))["method"]) == expected
+    assert methods_in(tmp_path) == expected
     shutil.rmtree(tmp_path / "saf" / f"{ENV}_1")
     shutil.rmtree(tmp_path / "saf" / f"{ENV}_3")
     settings = load_settings("mappo", ENV, "smoke")
     write_run(tmp_path / "mappo" / f"{ENV}_1", settings.as_dict(), 0, "")
-    assert set(describe(find_runs(tmp_path))["method"]) == {"mappo", expected[1]}  # beside another method, too
+    assert set(methods_in(tmp_path)) == {"mappo", expected[1]}  # beside another method, too
 
 
 def sized_game(size: int, method: str = "") -> CounterEnv:
-    """Make a game of parameters that are named as columns of the table."""
+    """Make a game of parameters that are named as properties of runs."""
     return CounterEnv(max_cycles=size)
 
 
-def test_a_parameter_of_a_game_may_be_named_as_a_column(tmp_path: Path) -> None:
+def test_a_parameter_of_a_game_may_be_named_as_a_property_of_runs(tmp_path: Path) -> None:
     sizes: list[Size] = ["small", "smoke"]
     for number, size in enumerate(sizes, start=1):
-        settings = load_settings("saf", f"{__name__}:sized_game", size, {"size": 8, "method": "a"})
+        settings = load_settings("saf", f"{__name__}:sized_game", size, {"size": 8, "method": str(number)})
         write_run(tmp_path / "saf" / f"Sized_{number}", settings.as_dict(), 0, "")
-    table = describe(find_runs(tmp_path))
-    assert sorted(table["size"]) == sizes and set(table["size of the game"]) == {8}
-    assert set(table["method"]) == {"saf"} and set(table["method of the game"]) == {"a"}
+    named = [(one.method, one.setting.partition(", ")[2]) for one in describe(find_runs(tmp_path))]
+    assert named == [("saf", "size small, method 1"), ("saf", "size smoke, method 2")]
 
 
 def test_runs_of_games_that_are_not_registered_are_found_by_others_names(

@@ -6,9 +6,7 @@ import argparse
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from sb3_saf.suites.registry import folder_name
 from sb3_saf.teams.checks import unknown_name
@@ -24,7 +22,6 @@ from sb3_saf.training.folders import FINISHED, RUN_FILE, Run, python_command
 from sb3_saf.training.settings import Settings, load_settings
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 PROGRAM: Final = "python -m sb3_saf.plot"
@@ -73,36 +70,30 @@ def _draw(options: argparse.Namespace) -> Figure:
 
     from sb3_saf.training.figures import TEAM_RETURN, draw_curves
 
-    runs, reasons = [], []
+    curves, reasons = {}, []
     for run in find_runs(options.log_folder, options.algos, options.env):
         try:
-            run.curve(options.source)
-            runs.append(run)
+            curves[run] = run.curve(options.source)
         except ValueError as error:
             reasons.append(str(error))
-    if not runs:
+    if not curves:
         raise ValueError(reasons[0])
+    named = describe(list(curves))
+    # Curves end where the shortest of a method ends.
+    finished = {(one.setting, one.method) for one in named if is_finished(one.run)}
+    drawn = [one for one in named if is_finished(one.run) or (one.setting, one.method) not in finished]
+    reasons += [f"{one.run.folder} is not finished, others of its method are" for one in named if one not in drawn]
     for reason in reasons:
         print(f"left out: {reason}", file=sys.stderr)
-    table = describe(runs)
-    table["setting"] = setting_names(table)
-    table["finished"] = [(run.folder / FINISHED).is_file() for run in table["run"]]
-    # Curves end where the shortest of a method ends.
-    is_cut = ~table["finished"] & table.groupby(["setting", "method"])["finished"].transform("any")
-    for run in table["run"][is_cut]:
-        print(f"left out: {run.folder} is not finished, others of its method are", file=sys.stderr)
-    table = table[~is_cut]
-    for method, changes in dict(zip(table["method"], table["changes"], strict=True)).items():
+    for method, changes in {one.method: one.changes for one in drawn}.items():
         if changes not in method:
             print(f"{method}: {changes}")
-    are_treasures = all(run.settings.n_treasures is not None for run in table["run"])
-    y_label = TEAM_RETURN if are_treasures else "team return"
-    names = ("method", "seed", "setting")
-    curves = [row.run.curve(options.source).assign(**{k: getattr(row, k) for k in names}) for row in table.itertuples()]
-    return draw_curves(pd.concat(curves), options.title, panel="setting", y_label=y_label)
+    y_label = "team return" if any(one.run.settings.n_treasures is None for one in drawn) else TEAM_RETURN
+    tables = [curves[one.run].assign(method=one.method, seed=one.run.seed, setting=one.setting) for one in drawn]
+    return draw_curves(pd.concat(tables), options.title, panel="setting", y_label=y_label)
 
 
-# --- runs as a table --------------------------------------------------------------------------------------------------
+# --- names of runs ----------------------------------------------------------------------------------------------------
 
 
 def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str] = ()) -> list[Run]:
@@ -127,44 +118,62 @@ def find_runs(folder: Path, algos: Collection[str] = (), env_ids: Collection[str
     return sorted(runs, key=lambda run: run.number)
 
 
-def describe(runs: Sequence[Run]) -> pd.DataFrame:
-    """
-    Describe runs in a table.
+def is_finished(run: Run) -> bool:
+    """Return whether a run has reached its end."""
+    return (run.folder / FINISHED).is_file()
 
-    :return: columns ``run``, ``method``, ``changes``, ``seed``, ``env``, ``size`` and the parameters of the game;
-        ``default`` stands for those that only other runs of the game state. A method's name contains its differences
-        from the zoo's settings and from other runs, or a number if these are too many; ``changes`` lists them. Of runs
-        that differ only in their number, the table has the latest, of finished ones if there are any
-    """
-    import pandas as pd
 
-    stated: dict[str, dict[str, str]] = {}
-    for run in runs:
-        stated.setdefault(run.settings.env_id, {}).update(dict.fromkeys(run.settings.env_kwargs, _DEFAULT))
-    from_zoo = [_different_from_the_zoo(run.settings) | _measured_otherwise(run) for run in runs]
-    kinds = [(run.settings.algo, run.settings.size, run.settings.env_id) for run in runs]
+class Named(NamedTuple):
+    """
+    A run with its names.
+
+    :param setting: its games: the environment, with the size and the parameters in which runs of it differ; ``default``
+        stands for a parameter that only other runs state
+    :param method: with its differences from the zoo's settings and from other runs, or a number if these are too many
+    :param changes: these differences
+    """
+
+    run: Run
+    setting: str
+    method: str
+    changes: str
+
+
+def describe(runs: Sequence[Run]) -> list[Named]:
+    """Name runs; of those that differ only in their number, only the latest, of finished ones if there are any."""
+    from_zoo = {run: _different_from_the_zoo(run.settings) | _measured_otherwise(run) for run in runs}
     variants: dict[str, dict[str, int]] = {}
-    rows = []
-    for run, kind, own in zip(runs, kinds, from_zoo, strict=True):
+    named = []
+    for run, own in from_zoo.items():
+        algo, size = run.settings.algo, run.settings.size
+        beside = [other for other in runs if other.settings.env_id == run.settings.env_id]
         # What all runs of the algorithm at that size share is not named.
-        alike = [other for of, other in zip(kinds, from_zoo, strict=True) if of == kind]
-        beside = [other for of, other in zip(kinds, from_zoo, strict=True) if of[2] == kind[2]]
-        others = {key: beside if key in _MEASURED else alike for key in own}
-        named = sorted(key for key, value in own.items() if any(other.get(key) != value for other in others[key]))
-        changes = " ".join(f"{key}={own[key]}" for key in named)
-        method = f"{kind[0]} {changes}".rstrip()
-        if len(named) > _MOST_NAMED:
-            numbers = variants.setdefault(kind[0], {})
-            method = f"{kind[0]}, variant {numbers.setdefault(changes, len(numbers) + 1)}"
-        identity = {"env": run.settings.env_id, "size": run.settings.size, "seed": run.seed}
-        level = {**stated[run.settings.env_id], **run.settings.env_kwargs}
-        taken = {*identity, "run", "changes", "method"}
-        level = {f"{name} of the game" if name in taken else name: value for name, value in level.items()}
-        rows.append({**identity, **level, "run": run, "changes": changes, "method": method})
-    table = pd.DataFrame(rows)
-    is_finished = np.array([(run.folder / FINISHED).is_file() for run in runs])
-    last = table.drop(columns="run").astype(str).iloc[np.argsort(is_finished, kind="stable")]
-    return table[~last.duplicated(keep="last").sort_index()].reset_index(drop=True)
+        alike = [other for other in beside if (other.settings.algo, other.settings.size) == (algo, size)]
+        differing = [
+            f"{key}={value}"
+            for key, value in sorted(own.items())
+            if any(from_zoo[other].get(key) != value for other in (beside if key in _MEASURED else alike))
+        ]
+        changes = " ".join(differing)
+        method = f"{algo} {changes}".rstrip()
+        if len(differing) > _MOST_NAMED:
+            numbers = variants.setdefault(algo, {})
+            method = f"{algo}, variant {numbers.setdefault(changes, len(numbers) + 1)}"
+        named.append(Named(run, _setting_name(run.settings, [other.settings for other in beside]), method, changes))
+    latest = {(*one[1:], one.run.seed): one for one in sorted(named, key=lambda one: is_finished(one.run))}
+    return [one for one in named if one in latest.values()]
+
+
+def _setting_name(own: Settings, beside: Sequence[Settings]) -> str:
+    """Return the name of the games, see :class:`Named`, beside those of all runs of the environment."""
+    name = own.env_id.removesuffix("-v0")
+    if any(other.size != own.size for other in beside):
+        name += f", size {own.size}"
+    for parameter in dict.fromkeys(parameter for other in beside for parameter in other.env_kwargs):
+        values = {str(other.env_kwargs.get(parameter, _DEFAULT)) for other in beside}
+        if len(values) > 1:
+            name += f", {parameter} {own.env_kwargs.get(parameter, _DEFAULT)}"
+    return name
 
 
 def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
@@ -191,19 +200,6 @@ def _measured_otherwise(run: Run) -> dict[str, str]:
     actions = "True" if given.get("deterministic_eval") else ""
     values = {"eval_env_kwargs": level, "trained_agent": beginning, "deterministic_eval": actions}
     return {name: value for name, value in values.items() if value}
-
-
-def setting_names(table: pd.DataFrame) -> list[str]:
-    """Name the games of each row of :func:`describe`: the environment, and the parameters in which its rows differ."""
-    named = {"method", "changes", "seed", "env", "run"}
-    columns = [column for column in table.columns if column not in named]
-    names: dict[Any, str] = {}
-    for env, rows in table.groupby("env", sort=False):
-        varying = [column for column in columns if rows[column].astype(str).nunique() > 1]
-        for index, row in rows[varying].iterrows():
-            parameters = [f"{name} {value}" for name, value in row.items()]
-            names[index] = ", ".join([str(env).removesuffix("-v0"), *parameters])
-    return [names[index] for index in table.index]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
