@@ -63,7 +63,7 @@ def load_yaml(text: str, source: str) -> Any:
         raise ValueError(f"{source} is not valid YAML: {reason}") from None
 
 
-def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[str, Any]:
+def read_settings(source: str | Path) -> dict[str, Any]:
     """
     Read a settings file, merged into its base files.
 
@@ -79,7 +79,6 @@ def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[st
         file = str(source)
     else:
         content, file = deepcopy(_config(source)), f"zoo_configs/{source}.yml"
-        refined_by = (*refined_by, source)
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{file} must map 'default' and environment ids to settings, got {reprlib.repr(content)}")
     base = content.pop(BASE, None)
@@ -98,10 +97,9 @@ def read_settings(source: str | Path, refined_by: Sequence[str] = ()) -> dict[st
             check_either(layer, what)
     if base is None:
         return content
-    others = [name for name in config_names() if name not in refined_by]
-    if base not in others:
-        raise unknown_name(f"base of {file}", base, others)
-    result = read_settings(base, refined_by)
+    if base not in config_names():
+        raise unknown_name(f"base of {file}", base, config_names())
+    result = read_settings(base)
     for key, entry in content.items():
         refined = merge(result.get(key, {}), entry)
         sizes = [one.get(SIZES_KEY, {}) for one in (result.get(key, {}), entry)]
