@@ -11,6 +11,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any, NoReturn, TypeVar
 
 import torch as th
@@ -130,13 +131,12 @@ def require(*modules: str) -> None:
             ) from None
 
 
-def import_packages(packages: Sequence[str]) -> None:
-    """Import the packages of ``--gym-packages``, which register environments."""
-    for package in packages:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise CommandError(f"--gym-packages: cannot import {package!r}: {error}") from error
+def imported_module(name: str) -> ModuleType:
+    """Import a module; a type for argparse."""
+    try:
+        return importlib.import_module(name)
+    except (ImportError, TypeError, ValueError) as error:  # argparse hides the last two
+        raise argparse.ArgumentTypeError(f"cannot import {name!r}: {error}") from error
 
 
 def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -> None:
@@ -147,10 +147,9 @@ def add_environment_options(parser: argparse._ActionsContainer, of_level: str) -
 
 
 def add_gym_packages(parser: argparse._ActionsContainer) -> None:
-    """Add ``--gym-packages``, see :func:`import_packages`."""
-    parser.add_argument(
-        "--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import, which register environments"
-    )
+    """Add ``--gym-packages``, which are imported at once."""
+    text = "modules to import, which register environments"
+    parser.add_argument("--gym-packages", nargs="+", type=imported_module, default=[], metavar="MODULE", help=text)
 
 
 def check_device(device: str) -> str:

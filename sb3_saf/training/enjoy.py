@@ -28,7 +28,6 @@ from sb3_saf.training.commands import (
     OneLineParser,
     add_environment_options,
     at_least,
-    import_packages,
     run_command,
     user_errors,
 )
@@ -75,7 +74,6 @@ def make_parser() -> argparse.ArgumentParser:
 def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
     """Measure, and show the first game meanwhile; return the team returns."""
     options = make_parser().parse_args(arguments)
-    import_packages(options.gym_packages)
     with user_errors(ValueError, RuntimeError, ImportError):
         seed = check_seed(options.seed)
         if options.team is None:

@@ -13,7 +13,6 @@ from sb3_saf.teams.checks import unknown_name
 from sb3_saf.training.commands import (
     OneLineParser,
     add_gym_packages,
-    import_packages,
     require,
     run_command,
     user_errors,
@@ -56,7 +55,6 @@ def plot(arguments: Sequence[str] | None = None) -> None:
     """Draw a figure and print its path."""
     options = make_parser().parse_args(arguments)
     require("pandas", "matplotlib")
-    import_packages(options.gym_packages)
     with user_errors():
         figure = _draw(options)
     options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,6 @@ from sb3_saf.training.commands import (
     OneLineParser,
     add_environment_options,
     at_least,
-    import_packages,
     run_command,
     user_errors,
 )
@@ -57,7 +56,6 @@ def make_parser() -> argparse.ArgumentParser:
 def write_page(arguments: Sequence[str] | None = None) -> Path:
     """Write the page and return its path."""
     options = make_parser().parse_args(arguments)
-    import_packages(options.gym_packages)
     with user_errors():
         seed = evaluation_seed(check_seed(options.seed))
         models = list(dict.fromkeys(options.model))

@@ -27,7 +27,6 @@ from sb3_saf.training.commands import (
     add_key_values,
     at_least,
     check_device,
-    import_packages,
     require,
     run_command,
     user_errors,
@@ -165,7 +164,6 @@ def train(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = make_parser().parse_args(given)
     _check(options)
-    import_packages(options.gym_packages)
     command = shlex.join([*PROGRAM.split(), *given])
     if options.optimize_hyperparameters:
         _tune(options, command)
