@@ -78,18 +78,16 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
         seed = check_seed(options.seed)
         if options.team is None:
             find_algorithm(options.algo)
-            environment = find_environment(options.env)
             which = "best" if options.load_best else options.load_checkpoint
-            run, path = find_model(options.log_folder, options.algo, environment, options.exp_id, which)
+            run, path = find_model(
+                options.log_folder, options.algo, find_environment(options.env), options.exp_id, which
+            )
         else:
             run = find_team(options.team)
             path = run.folder / WEIGHTS
         with version_in_errors(run):
             trained = run.settings
-        if options.team is not None:
-            options.algo, options.env, environment = trained.algo, trained.env_id, trained.environment
-        if (trained.algo, trained.env_id) != (options.algo, environment.id):
-            raise ValueError(f"{run.folder} is a run of {trained.algo} on {trained.env_id}; give its --algo and --env")
+        options.env = trained.env_id
         settings = saved_settings(trained.as_dict(), options.env_kwargs)
         mode = None if options.no_render else "ansi" if options.text else "rgb_array"
         games = settings.make_env(seed, evaluation=True, n_envs=options.episodes, render_mode=mode)
@@ -106,7 +104,7 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
             with open_screen(options, games) as show:
                 env = games if show is None else Film(games, show)
                 result = evaluate_team(policy, env, options.episodes, deterministic=options.deterministic)
-        print(f"{options.algo} on {options.env}, weights of {path}")
+        print(f"{trained.algo} on {trained.env_id}, weights of {path}")
         print(f"team return {result}")
         saved = SAVED_MODEL.fullmatch(path.name)
         if saved or options.team is not None or (run.folder / FINISHED).exists():
