@@ -179,15 +179,11 @@ def _different_from_the_zoo(settings: Settings) -> dict[str, str]:
     flat = []
     for one in (settings, load_settings(settings.algo, settings.env_id, settings.size, settings.env_kwargs)):
         own = {"n_envs": one.n_envs, "game_steps": one.game_steps, "time_limit": one.time_limit, **one.plain}
-        own |= one.wrapping
-        flat.append({**own, **own.pop("policy_kwargs", {})})
+        policy_kwargs = own.pop("policy_kwargs", {})
+        flat.append({**own, **one.wrapping, **policy_kwargs})
     ours, theirs = flat
-    values = {
-        key: ours.get(key, "default")
-        for key in {**theirs, **ours}
-        if repr(ours.get(key)) != repr(theirs.get(key)) and key != "policy_kwargs"
-    }
-    return {key: str(value) for key, value in values.items()}  # unrounded: what differs is another method
+    differing = [key for key in {**theirs, **ours} if repr(ours.get(key)) != repr(theirs.get(key))]
+    return {key: str(ours.get(key, _DEFAULT)) for key in differing}  # unrounded: what differs is another method
 
 
 def _measured_otherwise(run: Run) -> dict[str, str]:
