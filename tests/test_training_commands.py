@@ -182,7 +182,7 @@ def test_the_progress_bar_counts_game_steps() -> None:
 
 def test_a_line_for_every_tenth(capsys: pytest.CaptureFixture[str]) -> None:
     settings = load_settings("ippo", ENV, "smoke", overrides={"game_steps": 80})
-    settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=ProgressLines())
+    settings.make_model(settings.make_env(0), 0).learn(settings.total_timesteps, callback=ProgressLines(verbose=1))
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(" of ")[0].strip() for line in lines] == [f"{tenth} %" for tenth in range(10, 101, 10)]
     assert "team return" in lines[-1] and "about 0:00:00 (h:mm:ss) to go" in lines[-1]

@@ -176,9 +176,6 @@ class GameStepsProgressBar(ProgressBarCallback):
         self.pbar.update(self.training_env.num_envs // require_n_agents(self.training_env))
         return True
 
-    def _on_training_end(self) -> None:
-        self.close()
-
     def close(self) -> None:
         """Close the bar, also if training never began, or ended by an error."""
         if hasattr(self, "pbar"):
@@ -187,9 +184,6 @@ class GameStepsProgressBar(ProgressBarCallback):
 
 class ProgressLines(BaseCallback):
     """Print a line for every tenth of the training, for log files and terminals without a progress bar."""
-
-    def __init__(self, verbose: int = 1) -> None:
-        super().__init__(verbose)
 
     def _on_training_start(self) -> None:
         self._total = self.locals["total_timesteps"] // require_n_agents(self.training_env)
