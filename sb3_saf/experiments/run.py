@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from textwrap import shorten
 from typing import Any, NamedTuple
 
 from filelock import BaseFileLock
-from tqdm import tqdm
 
 from sb3_saf.experiments.cell import Job
 from sb3_saf.experiments.definitions import Cell, Experiment, RunConfig, Selection, Shard, expand
@@ -139,19 +137,15 @@ def run(
         f"{experiment.name}: {len(everything)} cells{part}; {len(cells) - len(todo)} finished, {len(todo)} to run in "
         f"{results.folder}"
     )
-    # On a terminal a bar with the remaining time; in a log file a line per cell.
-    with tqdm(total=len(todo), unit="cell", disable=None, dynamic_ncols=True) as bar, progress, engine:
-        for line in progress.lines():
-            bar.update(progress.n_ended - bar.n)
-            bar.write(line, file=sys.stdout)
-    summary = Summary(len(progress.finished), progress.failed, progress.elsewhere)
+    progress.work()
+    summary = Summary(progress.n_finished, progress.failed, progress.elsewhere)
     if summary.elsewhere:
         print(f"{len(summary.elsewhere)} cells were left to another run in {results.folder}")
     write_tables(experiment, results)
     return summary
 
 
-class _Progress(AbstractContextManager["_Progress"]):
+class _Progress:
     """Cells of one run: waiting, running, ended."""
 
     def __init__(
@@ -160,34 +154,35 @@ class _Progress(AbstractContextManager["_Progress"]):
         self._config, self._results, self._engine, self._options = config, results, engine, options
         self._waiting = deque((cell, 1) for cell in todo)
         self._at_work: dict[Future[None], Attempt] = {}
-        self.finished: list[Cell] = []
+        self.n_finished = 0
         self.failed: list[Cell] = []
         self.elsewhere: list[Cell] = []
         self._n_cells, self._clock = len(todo), time.monotonic()
-        self._game_steps = {cell.id: config.settings(cell).game_steps for cell in todo if cell.is_trained}
-
-    def __exit__(self, *_: object) -> None:
-        """Release the locks of the cells."""
-        for attempt in self._at_work.values():
-            attempt.lock.release()
+        #: Game steps of the cells that have not ended, and of those that are finished.
+        self._left = {cell.id: config.settings(cell).game_steps if cell.is_trained else 0 for cell in todo}
+        self._played = 0
 
     @property
-    def n_ended(self) -> int:
-        """Number of cells that this run will not run again."""
-        return len(self.finished) + len(self.failed) + len(self.elsewhere)
+    def _count(self) -> str:
+        """How many cells have ended, of how many."""
+        return f"[{self._n_cells - len(self._left)}/{self._n_cells}]"
 
-    def lines(self) -> Iterator[str]:
-        """Run all cells; yield a line about each attempt."""
-        self._start_some()
-        while self._at_work:
-            done, _ = wait(self._at_work, return_when=FIRST_COMPLETED)
-            for future in done:
-                attempt = self._at_work[future]
-                line = self._end(attempt, future.exception())
-                del self._at_work[future]
+    def work(self) -> None:
+        """Run all cells, close the engine, and release the locks of cells that are still at work after an error."""
+        try:
+            with self._engine:
+                self._start_some()
+                while self._at_work:
+                    done, _ = wait(self._at_work, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        attempt = self._at_work[future]
+                        print(self._end(attempt, future.exception()), flush=True)
+                        del self._at_work[future]
+                        attempt.lock.release()
+                    self._start_some()
+        finally:
+            for attempt in self._at_work.values():
                 attempt.lock.release()
-                yield line
-            self._start_some()
 
     def _start_some(self) -> None:
         while self._waiting and len(self._at_work) < self._engine.slots:
@@ -196,6 +191,7 @@ class _Progress(AbstractContextManager["_Progress"]):
             tests = () if lock is None else self._results.missing_tests(cell)
             if lock is None or not tests:  # another run has locked or finished it
                 self.elsewhere.append(cell)
+                del self._left[cell.id]
                 if lock is not None:
                     lock.release()
                 continue
@@ -221,30 +217,29 @@ class _Progress(AbstractContextManager["_Progress"]):
 
     def _end(self, attempt: Attempt, error: BaseException | None) -> str:
         """Store the result or the error of an attempt; return a line about it."""
-        cell, count = attempt.cell, f"[{self.n_ended + 1}/{self._n_cells}]"
+        cell = attempt.cell
         folder = self._results.unfinished(cell)
         asked = [folder / "result" / "tests" / f"{level.slug}.json" for level in Job.read(folder).cell.tests]
         if error is None and not all(path.exists() for path in asked):
             error = RuntimeError("the worker ended without results; does the game end its process?")
         if error is None:
             self._results.publish(cell)
-            self.finished.append(cell)
+            self.n_finished += 1
+            self._played += self._left.pop(cell.id)
             found = [(level, self._results.test(cell, level)) for level in cell.tests]
             returns = ", ".join(f"{test.evaluation.mean:.2f} ({level})" for level, test in found if test is not None)
             # The rate of this run, and the remaining time at that rate.
-            ended = {one.id for one in (*self.finished, *self.failed, *self.elsewhere)}
-            played = sum(self._game_steps.get(one.id, 0) for one in self.finished)
-            left = sum(steps for cell_id, steps in self._game_steps.items() if cell_id not in ended)
-            if not played or not left:
-                return f"{count} {cell}: return {returns}"
-            rate = played / (time.monotonic() - self._clock)
-            remaining = timedelta(seconds=round(left / rate))
-            return f"{count} {cell}: return {returns}; {rate:,.0f} game steps/s, about {remaining} (h:mm:ss) left"
+            speed = ""
+            if self._played and (left := sum(self._left.values())):
+                rate = self._played / (time.monotonic() - self._clock)
+                speed = f"; {rate:,.0f} game steps/s, about {timedelta(seconds=round(left / rate))} (h:mm:ss) left"
+            return f"{self._count} {cell}: return {returns}{speed}"
         reason = shorten(str(error).strip().splitlines()[-1], width=160, placeholder=" ...")
         if attempt.number <= self._options.retries:
             self._waiting.append((cell, attempt.number + 1))
-            return f"[{self.n_ended}/{self._n_cells}] {cell}: attempt {attempt.number} failed, trying again: {reason}"
+            return f"{self._count} {cell}: attempt {attempt.number} failed, trying again: {reason}"
         self.failed.append(cell)
+        del self._left[cell.id]
         path = folder / "error.txt"
         write_text(path, str(error))
-        return f"{count} {cell}: FAILED: {reason}; see {path}"
+        return f"{self._count} {cell}: FAILED: {reason}; see {path}"
