@@ -42,16 +42,14 @@ from sb3_saf.training.yaml_files import SIZES, Size
 DEFAULT_SIZE: Final[Size] = "small"
 #: The protocol of the size smoke, which is for trying commands.
 _SMOKE: Final = {"episodes": 16, "eval_freq": 200, "eval_episodes": 2}
-#: Exit code of a process ended by Ctrl-C.
-_INTERRUPTED: Final = 128 + signal.SIGINT
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    :return: 0 for success, 1 if cells failed or differ, 130 if a run was interrupted
-    :raises SystemExit: with 2 if the command was invalid
+    :return: 0 for success, 1 if cells failed or differ
+    :raises SystemExit: with 2 if the command was invalid, 130 if it was interrupted
     """
     options = _parser().parse_args(arguments)
     if options.command == "cell":  # its errors go to error.txt with a traceback
@@ -265,7 +263,7 @@ def _run(options: argparse.Namespace) -> int:
             "\ninterrupted: workers have ended, finished cells and checkpoints are kept; the same command continues",
             file=sys.stderr,
         )
-        return _INTERRUPTED
+        raise
     print(f"table: {results.folder / experiment.name / 'runs.csv'}")
     if summary.failed:
         print(f"{len(summary.failed)} cells failed; the same command tries them again", file=sys.stderr)
