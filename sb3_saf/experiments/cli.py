@@ -277,19 +277,17 @@ def _report(options: argparse.Namespace) -> int:
     name = experiment.name
     require("pandas", "matplotlib", "rliable")
     remedy = f"run it first: {python_command(MODULE)} run {name} --size {_size(options)} -f {results.folder}"
-    if not results.folder.is_dir():
-        raise ValueError(f"there is no folder {results.folder}; name another with -f, or {remedy}")
     if results.config() is None or not results.selections(name):
         damaged = "".join(f" ({error})" for error in results.damaged.values())
-        raise ValueError(f"{results.folder} has no results of {name!r}{damaged}; {remedy}")
+        raise ValueError(f"{results.folder} has no results of {name!r}{damaged}; name another with -f, or {remedy}")
     from sb3_saf.experiments.report import write_report
     from sb3_saf.experiments.tables import read_results
 
     report = write_report(experiment, results, selection, [read_results(path, name) for path in options.beside])
-    print(f"page: {report.page}")
-    print(f"figures: {', '.join(path.name for path in report.figures)}")
+    print(f"page: {results.folder / name / 'report.md'}")
+    print(f"figures: {', '.join(report.figures)}")
     if report.missing:
-        print(f"{len(report.missing)} of {report.n_cells} cells are missing; the page names them", file=sys.stderr)
+        print(f"{len(report.missing)} of {len(report.cells)} cells are missing; the page names them", file=sys.stderr)
     return 0
 
 

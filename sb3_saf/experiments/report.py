@@ -64,18 +64,27 @@ from sb3_saf.training.statistics import (
 WORDS = {name: method.words for name, method in METHODS.items()}
 
 
-class Report(NamedTuple):
-    """Paths of the Markdown page and its figures, and the requested cells with the unfinished ones."""
+class Content(NamedTuple):
+    """
+    Content of a report.
 
-    page: Path
-    figures: list[Path]
-    missing: list[Cell]
-    n_cells: int
+    :param cells: all requested cells
+    :param frames: tables of tests and curves, see ``tables``
+    :param figures: names of their files
+    """
+
+    experiment: Experiment
+    config: RunConfig
+    results: Results
+    cells: Sequence[Cell]
+    missing: Sequence[Cell]
+    frames: Frames
+    figures: Sequence[str]
 
 
 def write_report(
     experiment: Experiment, results: Results, wanted: Selection, published: Sequence[Frames] = ()
-) -> Report:
+) -> Content:
     """
     Write the report of an experiment, complete or not. The old report is replaced when the new one is complete.
 
@@ -112,7 +121,7 @@ def write_report(
         (fresh / "marl_eval.json").write_text(json.dumps(marl_eval(frames, environment), indent=1), encoding="utf-8")
         for file in (*figures, "marl_eval.json", "report.md"):
             os.replace(fresh / file, folder / file)
-    return Report(folder / "report.md", [folder / file for file in figures], missing, len(cells))
+    return content
 
 
 def _maximum(tests: pd.DataFrame) -> float | None:
@@ -203,23 +212,6 @@ def _curves(experiment: Experiment, frames: Frames) -> dict[str, Figure]:
 #: Maximum number of missing cells to list.
 _MOST_NAMED: Final = 20
 _NOTHING: Final = "–"
-
-
-class Content(NamedTuple):
-    """
-    Content of a page.
-
-    :param cells: all requested cells
-    :param frames: tables of tests and curves, see ``tables``
-    """
-
-    experiment: Experiment
-    config: RunConfig
-    results: Results
-    cells: Sequence[Cell]
-    missing: Sequence[Cell]
-    frames: Frames
-    figures: Sequence[str]
 
 
 def page(content: Content) -> str:
