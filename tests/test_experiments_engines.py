@@ -35,15 +35,6 @@ def test_workers_have_the_threads_that_they_are_given(tmp_path: Path) -> None:
     assert all((tmp_path / name / "log.txt").read_text() == "3\n" for name in THREAD_VARIABLES)
 
 
-def test_closing_ends_the_workers_with_a_last_checkpoint(tmp_path: Path) -> None:
-    with LocalEngine(1, command=WORKER) as engine:
-        folder = order(tmp_path, "a", "sleep")
-        engine.submit(folder)
-        wait_until(lambda: (folder / "pid").exists() and (folder / "pid").read_text())
-    assert not is_running(int((folder / "pid").read_text()))
-    assert (folder / "checkpoint").exists()
-
-
 DRIVER = """
     import signal
     from pathlib import Path
