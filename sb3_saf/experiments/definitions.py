@@ -41,19 +41,18 @@ _PAPER_SAF: Final[dict[str, Any]] = {
     **{"heads": "per_agent", "critic_input": "team"},
     **{"n_policies": 4, "n_slots": 4, "latent_dim": 64, "projection_arch": [128, 128]},
 }
-_ACTORS: Final[dict[str, dict[str, Any]]] = {
-    "own": {"n_policies": 1, "heads": "per_agent", "critic_heads": "shared"},
-    "shared": {"n_policies": 1},
-    "pool": {"n_policies": 4},
+#: Actors and critics in words, with their arguments of the policy.
+_ACTORS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
+    "own": ("an actor each", {"n_policies": 1, "heads": "per_agent", "critic_heads": "shared"}),
+    "shared": ("one actor", {"n_policies": 1}),
+    "pool": ("pool of four", {"n_policies": 4}),
 }
-_CRITICS: Final[dict[str, dict[str, Any]]] = {
-    "own": {"knowledge_source": False, "critic_input": "own"},
-    "team": {"knowledge_source": False, "critic_input": "team"},
-    "mean": {"knowledge_source": False, "critic_input": "mean"},
-    "source": {"n_slots": 4, "latent_dim": 64, "projection_arch": [128, 128]},
+_CRITICS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
+    "own": ("own view", {"knowledge_source": False, "critic_input": "own"}),
+    "team": ("concatenation", {"knowledge_source": False, "critic_input": "team"}),
+    "mean": ("mean pool", {"knowledge_source": False, "critic_input": "mean"}),
+    "source": ("knowledge source", {"n_slots": 4, "latent_dim": 64, "projection_arch": [128, 128]}),
 }
-_ACTOR_WORDS: Final = {"own": "an actor each", "shared": "one actor", "pool": "pool of four"}
-_CRITIC_WORDS: Final = {"own": "own view", "team": "concatenation", "mean": "mean pool", "source": "knowledge source"}
 #: Methods that are more than an algorithm's name, or have another name in words.
 METHODS: Final[dict[str, Method]] = {
     RANDOM: Method("", "random"),
@@ -70,11 +69,9 @@ METHODS: Final[dict[str, Method]] = {
     "qplex-pool": Method("qplex-pool", "QPLEX with pool"),
     "pqn": Method("pqn", "PQN-VDN"),
     **{
-        f"actor-{actor}-critic-{critic}": Method(
-            "saf", f"{_ACTOR_WORDS[actor]}, {_CRITIC_WORDS[critic]}", {**_ACTORS[actor], **_CRITICS[critic]}
-        )
-        for actor in _ACTORS
-        for critic in _CRITICS
+        f"actor-{actor}-critic-{critic}": Method("saf", f"{words}, {critic_words}", {**of_actor, **of_critic})
+        for actor, (words, of_actor) in _ACTORS.items()
+        for critic, (critic_words, of_critic) in _CRITICS.items()
     },
 }
 
