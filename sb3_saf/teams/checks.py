@@ -9,6 +9,7 @@ from numbers import Integral
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 #: Largest seed of a run: the limit of NumPy's global generator, which SB3 seeds.
 MAX_SEED: Final = 2**32 - 1
@@ -88,25 +89,14 @@ def import_by_name(module: str, name: str, what: str) -> Any:
     return value
 
 
-def check_form(name: str, value: Any, like: Any) -> None:
-    """Check names, shapes and dtypes of nested dicts and lists of arrays; the ValueError is of the first difference."""
-    if isinstance(like, Mapping):
-        if not isinstance(value, Mapping) or value.keys() != like.keys():
-            found = list(value) if isinstance(value, Mapping) else type(value).__name__
-            raise ValueError(f"expected {name} to have the entries {list(like)}, got {found}")
-        for key, part in like.items():
-            check_form(f"{name}[{key!r}]", value[key], part)
-    elif isinstance(like, (list, tuple)):
-        if not isinstance(value, (list, tuple)) or len(value) != len(like):
-            raise ValueError(f"expected {name} to be {len(like)} values, got {value!r:.80}")
-        for index, part in enumerate(like):
-            check_form(f"{name}[{index}]", value[index], part)
-    elif isinstance(like, np.ndarray):
-        shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-        if shape != like.shape or dtype != like.dtype:
-            raise ValueError(f"expected {name} of shape {like.shape} and {like.dtype}, got {shape} and {dtype}")
-    elif not isinstance(value, type(like)):
-        raise ValueError(f"expected {name} to be a {type(like).__name__}, got {value!r:.80}")
+def check_form(name: str, value: Mapping[str, Any], like: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Check names, shapes and dtypes of arrays by name; the ValueError is of the first difference."""
+    if value.keys() != like.keys():
+        raise ValueError(f"expected {name} to have the entries {list(like)}, got {list(value)}")
+    for key, part in like.items():
+        shape, dtype = value[key].shape, value[key].dtype
+        if shape != part.shape or dtype != part.dtype:
+            raise ValueError(f"expected {name}[{key!r}] of shape {part.shape} and {part.dtype}, got {shape} and {dtype}")
 
 
 class ExportError(ValueError):
