@@ -96,7 +96,9 @@ def check_form(name: str, value: Mapping[str, Any], like: Mapping[str, npt.NDArr
     for key, part in like.items():
         shape, dtype = value[key].shape, value[key].dtype
         if shape != part.shape or dtype != part.dtype:
-            raise ValueError(f"expected {name}[{key!r}] of shape {part.shape} and {part.dtype}, got {shape} and {dtype}")
+            raise ValueError(
+                f"expected {name}[{key!r}] of shape {part.shape} and {part.dtype}, got {shape} and {dtype}"
+            )
 
 
 class ExportError(ValueError):

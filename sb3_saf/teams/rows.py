@@ -184,30 +184,20 @@ class TeamSpaces:
         """
         if not isinstance(space, spaces.Dict) or not set(TEAM_KEYS) <= set(space.spaces) <= ALL_KEYS:
             raise ValueError(_not_a_team_space(f"got {space}"))
-        own, team, agent = (space.spaces[key] for key in TEAM_KEYS)
+        own, agent = space.spaces[OBS_KEY], space.spaces[AGENT_KEY]
         if not isinstance(agent, spaces.Discrete) or agent.start != 0:
             raise ValueError(_not_a_team_space(f"its {AGENT_KEY!r} must be Discrete(N) from 0, got {agent}"))
-        n_agents = int(agent.n)
-        expected = (n_agents, *(own.shape or ()))
-        if not isinstance(team, spaces.Box) or team.shape != expected or team.dtype != own.dtype:
-            raise ValueError(
-                _not_a_team_space(
-                    f"its {TEAM_KEY!r} must be a Box of shape {expected} and dtype {own.dtype}, got {team}"
-                )
-            )
-        active, action_mask, state = (space.spaces.get(key) for key in OPTIONAL_KEYS)
-        if active is not None and active != spaces.MultiBinary(n_agents):
-            raise ValueError(_not_a_team_space(f"its {ACTIVE_KEY!r} must be MultiBinary({n_agents}), got {active}"))
-        if action_mask is not None and not (
-            isinstance(action_mask, spaces.MultiBinary) and len(action_mask.shape) == 1
-        ):
-            raise ValueError(_not_a_team_space(f"its {ACTION_MASK_KEY!r} must be MultiBinary(A), got {action_mask}"))
-        starts = space.spaces.get(EPISODE_START_KEY)
-        if starts is not None and starts != spaces.Discrete(2):
-            raise ValueError(_not_a_team_space(f"its {EPISODE_START_KEY!r} must be Discrete(2), got {starts}"))
-        n_masked = None if action_mask is None else action_mask.shape[0]
+        active, action_mask, state, starts = (space.spaces.get(key) for key in (*OPTIONAL_KEYS, EPISODE_START_KEY))
+        n_masked = None if action_mask is None else prod(action_mask.shape or ())
         names, conversions = (getattr(agent, name, None) for name in ("names", "conversions"))
-        return cls(own, n_agents, active is not None, n_masked, state, names, conversions, starts is not None)
+        team = cls(own, int(agent.n), active is not None, n_masked, state, names, conversions, starts is not None)
+        for key, part in team._joint.items():
+            given = space.spaces[key]
+            if (given.shape, given.dtype) != (part.shape, part.dtype):
+                raise ValueError(
+                    _not_a_team_space(f"its {key!r} must be of shape {part.shape} and {part.dtype}, got {given}")
+                )
+        return team
 
     @cached_property
     def team(self) -> spaces.Box:
