@@ -484,7 +484,7 @@ def test_right_actions(bridge: Bridge, n_cpus: int, space: spaces.Space[Any], ac
 @one_and_two_cpus
 def test_order_of_calls(bridge: Bridge, n_cpus: int) -> None:
     venv = bridge(CounterEnv, n_games=2, n_cpus=n_cpus)
-    with pytest.raises(RuntimeError, match=r"no episode has begun .* call reset\(\) before step\(\)"):
+    with pytest.raises(ValueError, match=r"no episode has begun .* call reset\(\) before step\(\)"):
         venv.step(zeros(venv))
     venv.reset()
     with pytest.raises(RuntimeError, match="no step has been started"):
@@ -516,7 +516,7 @@ def test_game_that_breaks(bridge: Bridge, n_cpus: int, how: str, error: type[Bas
     with pytest.raises(error):
         venv.step(zeros(venv))
     assert venv.get_attr("steps", indices=2) == [2]
-    with pytest.raises(RuntimeError, match=r"stopped by an error\): call reset\(\)"):
+    with pytest.raises(ValueError, match=r"stopped by an error\): call reset\(\)"):
         venv.step(zeros(venv))
     venv.seed(1)
     venv.reset()

@@ -15,14 +15,13 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 
 from sb3_saf.envs import audit
 from sb3_saf.envs.audit import Trial, check_is_parallel
-from sb3_saf.envs.game_copies import check_signatures, common_settings, signature
+from sb3_saf.envs.game_copies import check_signatures, common_settings, sign_games
 from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv
 from sb3_saf.envs.gymnasium_team import as_parallel
 from sb3_saf.envs.supersuit_games import TeamConcatVecEnv, game_factory
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.conversion import AgentConversion
-from sb3_saf.teams.rows import Array
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 #: Episodes of each game after which games that began alike are taken to ignore their seeds.
@@ -94,8 +93,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         self.possible_agents = list(reader.agents)
         #: How each agent's observations and actions become those of rows, for models that act on the game's own.
         self.conversions = tuple(reader.conversions.values())
-        self._closed = self._begun = self._has_warned = False
-        self._actions: Array | None = None
+        self._closed = self._has_warned = False
         #: Hashes of the first rows of each game's first episodes, to find games that ignore their seeds.
         self._beginnings: list[list[int]] = []
         self._games: TeamConcatVecEnv | WorkerGames
@@ -125,23 +123,14 @@ class SuperSuitVecEnv(TeamVecEnv):
         return cast(VecEnvObs, observations)
 
     def step_async(self, actions: npt.ArrayLike) -> None:
-        """
-        Store the actions of the next step.
-
-        :param actions: actions of the B rows; those of agents that have ended are ignored
-        :raises ValueError: if one is not in the action space; no game is stepped then
-        """
+        """Store the actions of the next step (see the base class)."""
         self._check_open()
-        if not self._begun:
-            raise RuntimeError("no episode has begun (or one was stopped by an error): call reset() before step()")
-        self._actions = self.checked_actions(actions)
+        super().step_async(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step all games; return observations, rewards (float32), dones (bool) and infos of the B rows."""
-        if self._actions is None:
-            raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
-        actions = self._actions
-        self._begun, self._actions = False, None
+        actions = self.actions_of_step()
+        self._begun = False
         observations, rewards, dones, infos, self.reset_infos, notes = self._run("play", actions)
         self._begun = True
         notes = [*notes, *self._note_beginnings(observations, np.flatnonzero(dones[:: self.n_agents]))]
@@ -204,9 +193,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Copy all games; pickled ones are signed (see :mod:`sb3_saf.envs.game_copies`)."""
         self._check_open()
         snapshots = [snapshot for some in self._games.run("snapshots", self._begun) for snapshot in some]
-        for snapshot in snapshots:
-            if "pickled" in snapshot:
-                snapshot["signature"] = signature(snapshot["pickled"])
+        sign_games(snapshots)
         return {
             "seeds": list(self.seeded_with),
             "next_seeds": self._seeds_of_games(),

@@ -54,6 +54,9 @@ class TeamVecEnv(VecEnv):
 
     #: N names of the agents.
     possible_agents: list[Any]
+    #: Whether an episode has begun, and the actions of its next step.
+    _begun = False
+    _actions: Array | None = None
 
     def __init__(
         self,
@@ -89,6 +92,24 @@ class TeamVecEnv(VecEnv):
         #: Seeds for the next reset; None continues the games' random streams.
         self._next_seeds: list[int] | None = chosen
         return self.per_row(chosen)
+
+    def step_async(self, actions: npt.ArrayLike) -> None:
+        """
+        Store the actions of the next step.
+
+        :param actions: actions of the B rows; those of agents that have ended are ignored
+        :raises ValueError: if one is not in the action space; no game is stepped then
+        """
+        if not self._begun:
+            raise ValueError("no episode has begun (or one was stopped by an error): call reset() before step()")
+        self._actions = self.checked_actions(actions)
+
+    def actions_of_step(self) -> Array:
+        """Return the actions of the step that has been started, which is over then."""
+        if self._actions is None:
+            raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
+        actions, self._actions = self._actions, None
+        return actions
 
     def checked_actions(self, actions: npt.ArrayLike) -> Array:
         """

@@ -150,8 +150,6 @@ class BatchVecEnv(TeamVecEnv):
         self.possible_agents = list(batch.agents)
         self.shares_reward = batch.shares_reward
         self.render_mode = render_mode
-        self._actions: Array | None = None
-        self._running = False
         self._stagger = stagger
         #: Games in an episode that is shorter than others, (E,).
         self._is_short = np.zeros(batch.n_games, dtype=np.bool_)
@@ -177,22 +175,11 @@ class BatchVecEnv(TeamVecEnv):
             self._is_short = self.batch.shorten()
         self._next_seeds = None
         self._reset_options()
-        self._running = True
+        self._begun = True
         return self._observations(rows)
 
     def _observations(self, rows: dict[str, Array]) -> VecEnvObs:
         return rows if self.batch.rows.is_dict else rows[OBS_KEY]
-
-    def step_async(self, actions: npt.ArrayLike) -> None:
-        """
-        Store the actions of the next step.
-
-        :param actions: (B, ...) from the action space
-        :raises ValueError: for a wrong shape, type or value, or a step without a reset
-        """
-        if not self._running:
-            raise ValueError("the games have not begun: call reset() before step()")
-        self._actions = self.checked_actions(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         """
@@ -200,11 +187,8 @@ class BatchVecEnv(TeamVecEnv):
 
         :return: observations (B, ...), rewards (B,) float32, dones (B,) bool, infos
         """
-        if self._actions is None:
-            raise RuntimeError("no step has been started: call step_async(actions) before step_wait()")
-        actions = self._actions.reshape(self.n_games, self.n_agents, *self._actions.shape[1:])
-        self._actions = None
-        step = self.batch.step(actions)
+        actions = self.actions_of_step()
+        step = self.batch.step(actions.reshape(self.n_games, self.n_agents, *actions.shape[1:]))
         rewards = np.array(step.rewards, dtype=np.float32).reshape(self.num_envs)
         dones = step.ended.repeat(self.n_agents)
         infos = self._infos(step, dones)
@@ -297,10 +281,10 @@ class ResumableBatchVecEnv(BatchVecEnv):
         :return: for :meth:`load_checkpoint_state` of an environment with the same arguments
         """
         return {
-            "running": self._running,
+            "running": self._begun,
             "next_seeds": self._next_seeds,
             "is_short": self._is_short.copy(),
-            "games": self.batch.snapshot() if self._running else {},
+            "games": self.batch.snapshot() if self._begun else {},
         }
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
@@ -310,10 +294,10 @@ class ResumableBatchVecEnv(BatchVecEnv):
         :raises ValueError: for the state of other games, naming the first difference
         """
         if state["running"]:
-            if not self._running:
+            if not self._begun:
                 self.batch.reset([0] * self.n_games)
             check_form("the games", state["games"], self.batch.snapshot())
             self.batch.restore(state["games"])
-        self._running = state["running"]
+        self._begun = state["running"]
         self._is_short = np.array(state["is_short"])
         self._next_seeds = None if state["next_seeds"] is None else list(state["next_seeds"])
