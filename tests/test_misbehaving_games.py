@@ -175,24 +175,6 @@ def test_each_fault_is_named_when_the_environment_is_made(fault: dict[str, Any],
         check_team_env(MisbehavingEnv(unequal=unequal, **fault))
 
 
-class KeysEnv(CounterEnv):
-    """Gives the names of its agents as the keys of a dict, by a property."""
-
-    @property
-    def possible_agents(self) -> Any:
-        return dict.fromkeys(["agent_0", "agent_1"]).keys()
-
-    @possible_agents.setter
-    def possible_agents(self, agents: Any) -> None:
-        if not isinstance(agents, list) or hasattr(self, "agents"):
-            raise AttributeError("no setter")
-
-
-def test_a_property_that_gives_no_list_is_named() -> None:
-    with pytest.raises(ValueError, match="got a property that returns dict_keys; let it return list"):
-        make_team_env(KeysEnv, 1, seed=0)
-
-
 class HelperEnv(Game):
     """Has attributes of its own with the names of others: neither a wrapped game nor masks for sb3-contrib."""
 

@@ -382,7 +382,7 @@ def set_game_attribute(env: Any, name: str, value: Any) -> None:
 
 
 def check_is_parallel(env: Any, is_factory: bool) -> None:
-    """Raise ValueError unless an object (perhaps a factory's) is a ParallelEnv; ``possible_agents`` becomes a list."""
+    """Raise ValueError unless an object (perhaps a factory's) is a ParallelEnv with agents."""
     origin = "a function that returned " if is_factory else ""
     if isinstance(env, AECEnv):
         raise ValueError(
@@ -404,15 +404,6 @@ def check_is_parallel(env: Any, is_factory: bool) -> None:
         raise ValueError(
             f"expected different names in possible_agents of {env}, got {doubles[0]!r} more than once in {agents}"
         )
-    if not isinstance(env.possible_agents, (list, tuple)):
-        bare = env.unwrapped if hasattr(env, "env") else env
-        try:
-            bare.possible_agents = agents
-        except AttributeError:
-            raise ValueError(
-                f"expected possible_agents of {env} to be a list, got a property that returns "
-                f"{type(env.possible_agents).__name__}; let it return list(...)"
-            ) from None
 
 
 def agents_of(env: Any) -> list[Any]:
