@@ -382,13 +382,10 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
                 f"{[agent for game, agent in missing if game == first]}; every row of a done team must carry its last "
                 "observation, as SB3's VecEnvs do"
             )
-        space: Any = self.venv.observation_space
-        stacked: Any
+        stacked: Any = observations
         if self._raw.is_dict:
             entries = [self._raw.entries(observation, "terminal observations") for observation in observations]
-            stacked = {key: self._stacked([entry[key] for entry in entries], games, space[key]) for key in entries[0]}
-        else:
-            stacked = self._stacked(observations, games, space)
+            stacked = {key: np.array([entry[key] for entry in entries]) for key in entries[0]}
         parts = self._checked_parts(stacked, "terminal observations", games)
         return {
             **parts,
@@ -396,17 +393,6 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
             AGENT_KEY: np.tile(self._agents[: self.n_agents], len(games)),
             EPISODE_START_KEY: (self._playing[games] == 0).reshape(-1).astype(np.int64),
         }
-
-    def _stacked(self, observations: list[Any], games: list[int], space: spaces.Space[Any]) -> Array:
-        try:
-            return np.array(observations)
-        except ValueError:
-            shapes = [np.shape(observation) for observation in observations]
-            odd = next((index for index, shape in enumerate(shapes) if shape != space.shape), 0)
-            raise ValueError(
-                f"expected terminal observations of one shape for the agents of game {games[odd // self.n_agents]}, "
-                f"got {sorted(set(shapes))}; make the environment return what its space promises"
-            ) from None
 
 
 class Untransposed(VecTransposeImage):
