@@ -108,24 +108,20 @@ class Trial:
                 )
         if not isinstance(observed, spaces.Dict) or len(observed.spaces) < 2:
             return None
-        masks = {key: space for key, space in observed.spaces.items() if looks_like_mask(key)}
-        keys = [key for key, space in masks.items() if space.shape == (n_entries,) and isinstance(space, FIXED_SHAPE)]
-        chosen = next((key for key in MASK_NAMES if key in keys), None)
-        for key, space in masks.items():
-            if key == chosen:
+        fitting = [key for key, space in observed.spaces.items() if space.shape == (n_entries,)]
+        chosen = next((key for key in MASK_NAMES if key in fitting), None)
+        for key, space in observed.spaces.items():
+            if key == chosen or not looks_like_mask(key):
                 continue
             if key == ACTION_MASK_KEY:
                 raise ValueError(
                     f"expected {ACTION_MASK_KEY!r} in observations to have one entry per choice of "
                     f"{self.actions[agent]}, {'none can be masked' if n_entries is None else n_entries}, got {space}"
                 )
-            if key not in keys:
-                why = f"which looks like action masks, but {space} does not fit the actions {self.actions[agent]}"
-            elif chosen is None:
-                why = f"which looks like action masks, whose name is {ACTION_MASK_KEY!r}"
-            else:
-                why = f"beside the action masks in {chosen!r}"
-            self._note(f"observations have {key!r}, {why}: it is an ordinary part of the observation")
+            self._note(
+                f"observations have {key!r}, {space}, which looks like action masks: it is an ordinary part of the "
+                f"observation; masks are {ACTION_MASK_KEY!r} with one entry per choice of {self.actions[agent]}"
+            )
         return chosen
 
     def _note(self, note: str) -> None:
