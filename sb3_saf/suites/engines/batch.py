@@ -112,9 +112,9 @@ class Batch(ABC):
         :param actions: (E, N, ...) from the action space
         """
 
-    @abstractmethod
     def picture(self, game: int) -> npt.NDArray[np.uint8]:
-        """Return the suite's picture of a game, (height, width, 3)."""
+        """Return the suite's picture of a game, (height, width, 3); not called of games with objects, which draw it."""
+        raise NotImplementedError
 
 
 class ResumableBatch(Batch):

@@ -65,11 +65,6 @@ class HECOGridGames(ResumableBatch):
     def _rows(self, views: Array) -> dict[str, Array]:
         return {OBS_KEY: views.reshape(-1, *views.shape[2:])}
 
-    def picture(self, game: int) -> npt.NDArray[np.uint8]:
-        """Return the picture of a game (see the base class)."""
-        picture: npt.NDArray[np.uint8] = self.objects[game].render()
-        return picture
-
     def snapshot(self) -> dict[str, Array]:
         """Return a copy of the state of all games (see the base class)."""
         return self._batch.snapshot()
