@@ -51,12 +51,8 @@ class SuperSuitVecEnv(TeamVecEnv):
     for a method that changes the game use :meth:`game_method`. ``action_masks`` is the exception, for sb3-contrib: it
     is called once per game, and if it returns a dict by agent, each row gets its own agent's mask.
 
-    With signals, the observation of a row is a Dict of ``"obs"``, the agent's own observation, and
-
-    - ``"active"``, Discrete(2): 1 while the row's agent takes part. In the last observation of an episode: 1 if the
-      agent was stopped by a time limit;
-    - ``"action_mask"``, MultiBinary(A): 1 for legal actions; zeros for agents that do not act;
-    - ``"state"``: the game's ``state()``, in the rows of all its agents, active or not.
+    With signals, the observation of a row is a Dict (see :class:`~sb3_saf.teams.rows.TeamSpaces`). In the last one of
+    an episode ``"active"`` is 1 if the agent was stopped by a time limit; masks of agents that do not act are zeros.
 
     At construction a trial episode of a copy is audited (:func:`sb3_saf.check_team_env`); in later steps shapes, and
     the bounds of integers, which index tables. An exception in a game is raised unchanged, also from a worker process;
