@@ -147,12 +147,6 @@ class CentralizedValueWrapper(TeamVecEnvWrapper):
         """
         Call a method of the rows' games; ``action_masks``, which MaskablePPO calls, is answered from the observations
         if these have ``action_mask`` and the games have no such method.
-
-        :param method_name: name of the method
-        :param method_args: positional arguments
-        :param indices: rows, None for all
-        :param method_kwargs: keyword arguments
-        :return: one result per row
         """
         self._has_asked_for_masks |= method_name == _ACTION_MASKS
         if self._shows_masks(method_name) and not super().has_attr(method_name):

@@ -17,12 +17,7 @@ PROGRAM: Final = "python -m sb3_saf.suites"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run the command line.
-
-    :return: 0
-    :raises SystemExit: with 2 if the command was invalid
-    """
+    """Run the command line and return 0; SystemExit with 2 if the command was invalid."""
     parser = argparse.ArgumentParser(prog=PROGRAM, description="Suites of cooperative games, and the tasks of one.")
     parser.add_argument(
         "name", nargs="?", help=f"one of {', '.join(suites())}: list all of its tasks; or a task, such as smax/2s3z"

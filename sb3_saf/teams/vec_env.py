@@ -160,12 +160,7 @@ class TeamVecEnv(VecEnv):
     def game_method(
         self, method_name: str, *args: Any, games: int | Iterable[int] | None = None, **kwargs: Any
     ) -> list[Any]:
-        """
-        Call a method once per game.
-
-        :param games: which games, None for all
-        :return: one result per game
-        """
+        """Call a method once per game of ``games``, None for all; return one result per game."""
         raise NotImplementedError
 
     def get_images(self) -> Sequence[npt.NDArray[Any] | None]:

@@ -160,12 +160,7 @@ class BatchVecEnv(TeamVecEnv):
         return {"stagger": self._stagger, **self.batch.settings}
 
     def reset(self) -> VecEnvObs:
-        """
-        Begin an episode in every game.
-
-        :return: (B, ...) rows
-        :raises ValueError: for options that the games do not take
-        """
+        """Begin an episode in every game and return the rows; ValueError for options that the games do not take."""
         options = self._options[:: self.n_agents]
         if any(options):
             self.batch.take_options(options)
@@ -182,11 +177,7 @@ class BatchVecEnv(TeamVecEnv):
         return rows if self.batch.rows.is_dict else rows[OBS_KEY]
 
     def step_wait(self) -> VecEnvStepReturn:
-        """
-        Step all games.
-
-        :return: observations (B, ...), rewards (B,) float32, dones (B,) bool, infos
-        """
+        """Step all games; return observations, rewards (float32), dones (bool) and infos of the B rows."""
         actions = self.actions_of_step()
         step = self.batch.step(actions.reshape(self.n_games, self.n_agents, *actions.shape[1:]))
         rewards = np.array(step.rewards, dtype=np.float32).reshape(self.num_envs)
@@ -266,20 +257,12 @@ def _filled(rows: dict[str, Array], n_agents: int) -> dict[str, Array]:
 
 
 class ResumableBatchVecEnv(BatchVecEnv):
-    """
-    VecEnv whose state is stored in checkpoints.
-
-    :param batch: games with snapshots
-    """
+    """VecEnv whose state is stored in checkpoints."""
 
     batch: ResumableBatch
 
     def checkpoint_state(self) -> dict[str, Any]:
-        """
-        Return the complete state as plain data.
-
-        :return: for :meth:`load_checkpoint_state` of an environment with the same arguments
-        """
+        """Return the complete state, plain data for an environment with the same arguments."""
         return {
             "running": self._begun,
             "next_seeds": self._next_seeds,
@@ -288,11 +271,7 @@ class ResumableBatchVecEnv(BatchVecEnv):
         }
 
     def load_checkpoint_state(self, state: Mapping[str, Any]) -> None:
-        """
-        Restore a state; the observations are those of that state.
-
-        :raises ValueError: for the state of other games, naming the first difference
-        """
+        """Restore a state; the ValueError for that of other games names the first difference."""
         if state["running"]:
             if not self._begun:
                 self.batch.reset([0] * self.n_games)
