@@ -43,6 +43,14 @@ def load_study(storage: str) -> optuna.Study:
     return optuna.load_study(study_name="s", storage=storage)
 
 
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a study with one trial, read-only."""
+    folder = tmp_path_factory.mktemp("tuned")
+    tune(folder)
+    return folder
+
+
 def test_two_processes_share_a_storage_and_the_best_trial_trains_again(tmp_path: Path) -> None:
     storage = f"sqlite:///{tmp_path}/study.db"
     words = given(tmp_path, "--storage", storage, "--n-evaluations", "1", "-params", "n_epochs:1")
@@ -101,9 +109,10 @@ def test_the_pruner_ends_a_trial() -> None:
     assert trial.value == trial.intermediate_values[1] >= 0
 
 
-def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tmp_path: Path) -> None:
-    sampled = to_overrides(tune(tmp_path).trials[0].params)
-    study = ("--storage", str(tmp_path / "study.log"), "--study-name", "s")
+def test_trial_zero_is_a_trial_and_what_the_user_gives_wins_over_it(tuned: Path, tmp_path: Path) -> None:
+    storage = str(tuned / "study.log")
+    sampled = to_overrides(load_study(storage).trials[0].params)
+    study = ("--storage", storage, "--study-name", "s")
     options = (*study, "-n", "40", "--eval-freq", "-1", "-f", str(tmp_path / "logs"))
     for number, trial in enumerate(("0", "best"), start=1):
         zoo_train.main([*SMOKE, *options, "--trial-id", trial])
@@ -141,8 +150,7 @@ def test_unknown_studies_and_trials_are_one_line(tmp_path: Path, capsys: pytest.
         assert words in failed([*SMOKE, *options], capsys)
 
 
-def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tune(tmp_path)
+def test_a_study_is_of_one_goal(tuned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "model.zip").touch()
     for other, words in (
         (("--algo", "mappo"), "algo was 'saf', now 'mappo'"),
@@ -153,7 +161,7 @@ def test_a_study_is_of_one_goal(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (("-params", "gamma:0.5"), "gamma"),
         (("-i", str(tmp_path / "model.zip")), "initial_model"),
     ):
-        line = failed(given(tmp_path, *other), capsys)
+        line = failed(given(tuned, *other), capsys)
         assert "the trials of the study 's' cannot be compared with these" in line and words in line
 
 
