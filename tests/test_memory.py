@@ -307,7 +307,7 @@ def test_every_weight_is_trained(policy: str, algorithm: Any, critic_memory: boo
     assert has_memory == critic_memory
 
 
-def test_two_runs_of_one_seed_end_alike_and_evaluation_between_changes_nothing() -> None:
+def test_evaluations_and_inspections_between_change_nothing_and_see_the_policy_that_remembers(tmp_path: Any) -> None:
     class Evaluate(BaseCallback):
         def _on_step(self) -> bool:
             if self.n_calls % 7 == 0:
@@ -317,17 +317,13 @@ def test_two_runs_of_one_seed_end_alike_and_evaluation_between_changes_nothing()
                 np.random.set_state(states[1])  # noqa: NPY002
             return True
 
-    found = [make_model().learn(40 * 9, callback=callback) for callback in (None, None, Evaluate())]
-    assert weights_of(found[0]) == weights_of(found[1])
-    assert weights_of(found[0]) == weights_of(found[2])
-
-
-def test_inspections_between_change_nothing_and_see_the_policy_that_remembers(tmp_path: Any) -> None:
-    callback = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=40, pictures=False)
-    plain = make_model(env=make_env((5, 5, 5))).learn(48 * 9)
-    watched = make_model(env=make_env((5, 5, 5)), tensorboard_log=str(tmp_path)).learn(48 * 9, callback=callback)
-    assert weights_of(plain) == weights_of(watched)
-    recorded = record_episodes(watched.policy, make_env(), 6, gamma=0.9)
+    inspection = InspectionCallback(make_env(), n_eval_episodes=6, every_game_steps=40, pictures=False)
+    plain, evaluated, inspected = (
+        make_model(tensorboard_log=str(tmp_path)).learn(48 * 9, callback=callback)
+        for callback in (None, Evaluate(), inspection)
+    )
+    assert weights_of(plain) == weights_of(evaluated) == weights_of(inspected)
+    recorded = record_episodes(inspected.policy, make_env(), 6, gamma=0.9)
     assert np.isfinite(recorded.values).all()
 
 
