@@ -1,9 +1,7 @@
-"""The reference world, compared with recorded episodes and with results worked out by hand from the rule book."""
+"""The reference world, compared with results worked out by hand from the rule book."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +10,6 @@ import pytest
 
 from tests.levels import State, level, params_for
 from tests.reference_world import ReferenceWorld
-
-TRACES = Path(__file__).parents[2] / "shared" / "traces"
-STATE = ("walls", "treasures", "keys", "agent_pos", "agent_dir", "agent_has_key")
 
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE, DONE = range(7)
 EAST, SOUTH, WEST, NORTH = range(4)
@@ -41,31 +36,6 @@ def colour_at(world: ReferenceWorld, viewer: int, ahead: int, aside: int = 0) ->
     """Return the colour in the middle of a tile: the agent's if drawn, else the cell's. Needs tiles of 12 pixels."""
     assert world.tile == 12, "in small tiles no pixel lies wholly inside the triangle"
     return tuple(tile_at(world, viewer, ahead, aside)[6, 6].tolist())
-
-
-# --------------------------------------------------------------------------------------------------- Recorded episodes
-
-
-@pytest.mark.skipif(not TRACES.is_dir(), reason="the recorded episodes are not here")
-@pytest.mark.parametrize("path", sorted(TRACES.glob("*.npz")), ids=lambda path: path.stem)
-def test_recorded_episode_bit_for_bit(path: Path) -> None:
-    with np.load(path) as file:
-        trace = {name: file[name] for name in file.files}
-    config = json.loads(str(trace["config"]))
-    world = ReferenceWorld(config.pop("task"), **config)
-    world.set_state({name: trace[name][0] for name in STATE})
-    for t in range(len(trace["actions"]) + 1):
-        if t > 0:
-            rewards = world.step(trace["actions"][t - 1].tolist(), list(range(world.n_agents)))
-            assert rewards == trace["rewards"][t - 1].tolist(), f"rewards of step {t}"
-        for name, array in world.get_state().items():
-            np.testing.assert_array_equal(array, trace[name][t], err_msg=f"{name} after step {t}")
-        for agent in range(world.n_agents):
-            picture = world.observe(agent)
-            assert picture.dtype == np.uint8
-            np.testing.assert_array_equal(
-                picture, trace["observations"][t, agent], err_msg=f"picture of agent {agent} after step {t}"
-            )
 
 
 # ------------------------------------------------------------------------------------------------- Zones and commands
