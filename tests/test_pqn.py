@@ -134,7 +134,7 @@ def test_a_batch_is_at_most_the_rollout() -> None:
 
 
 def test_saved_and_exported_teams_act_alike(tmp_path: Path) -> None:
-    model = make_model(telling_env(), rollout_steps=4)
+    model = make_model(telling_env(), rollout_steps=4, policy_kwargs={"net_arch": [16], "heads": "per_agent"})
     model.learn(40 * 3)
     model.save(tmp_path / "team.zip")
     loaded = PQN.load(tmp_path / "team.zip", device="cpu")
@@ -145,13 +145,16 @@ def test_saved_and_exported_teams_act_alike(tmp_path: Path) -> None:
     with th.no_grad():  # so that all actions are somebody's best
         for parameter in model.policy.actor.parameters():
             parameter.add_(th.randn_like(parameter))
-    actor, rng = Actor.load(export_actors(model, tmp_path / "actors")), np.random.default_rng(0)
+    folder, rng = export_actors(model, tmp_path / "actors"), np.random.default_rng(0)
+    actors = [Actor.load(folder, agent=agent) for agent in range(3)]
     chosen = set()
     for _ in range(20):
         masks = (rng.random(obs["action_mask"].shape) < 0.5).astype(np.int8)
         masks[np.arange(len(masks)), rng.integers(masks.shape[1], size=len(masks))] = 1
-        expected = model.predict({"obs": obs["obs"], "action_mask": masks}, deterministic=True)[0]
-        np.testing.assert_array_equal(actor.act(obs["obs"], action_mask=masks), expected)
+        expected = model.predict({**obs, "action_mask": masks}, deterministic=True)[0]
+        for agent, actor in enumerate(actors):
+            acted = actor.act(obs["obs"][agent::3], action_mask=masks[agent::3])
+            np.testing.assert_array_equal(acted, expected[agent::3])
         chosen |= set(expected.tolist())
     assert len(chosen) > 2
 
