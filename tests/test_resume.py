@@ -196,13 +196,13 @@ def test_a_run_that_was_struck_ends_as_the_undisturbed_one(name: str, tmp_path: 
         return [evaluation()] if name in EVALUATED else []
 
     whole = go_on(tmp_path / "whole", MODELS[name](), *evaluations())
-    for calls in (1, 2 * N_STEPS + 2, N_STEPS + 1):
+    for calls in (1, 2 * N_STEPS + 2):
         struck(tmp_path / "run", MODELS[name](), calls, *evaluations())
     np.random.seed(77)  # noqa: NPY002 - another process has other states
     th.manual_seed(77)
     model = go_on(tmp_path / "run", MODELS[name](), *evaluations())
-    assert model.num_timesteps == WHOLE and model._n_updates == whole._n_updates
-    assert weights_of(model) == weights_of(whole) != weights_of(MODELS[name]())
+    assert model.num_timesteps == WHOLE and model._n_updates == whole._n_updates > 0
+    assert weights_of(model) == weights_of(whole)
     if name == "PPO":
         assert weights_of(model) == undisturbed()
 
