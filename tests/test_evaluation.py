@@ -162,7 +162,7 @@ class Outcome(Game):
         won, team = self.n_games % 2 == 0, list(self.agents)
         ends |= {agent: self.t == 4 or (agent == "a" and self.t == 2 and not won) for agent in team}
         out[3] = dict.fromkeys(team, False)
-        told = {"every": True, "acting": self.t == 4, "won": self.t == 4 and won}
+        told = {"every": True, "acting": self.t == 4}
         for agent in team:
             if told.get(self.told, self.told == "a" == agent and ends["a"]):
                 infos[agent] = {"is_success": won and self.t == 4, "score": 7 if won else 3}
@@ -181,12 +181,6 @@ def test_what_is_of_the_episode_is_found_wherever_the_game_puts_it(told: str, tm
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer) == 16
     assert np.mean(model.ep_success_buffer) == 0.5
     assert sorted(entry["score"] for entry in model.ep_info_buffer) == [3] * 8 + [7] * 8
-
-
-def test_success_that_only_won_games_tell_is_named() -> None:
-    env = CentralizedValueWrapper(TeamMonitor(SuperSuitVecEnv(partial(Outcome, "won"), 2, seed=0)))
-    with pytest.warns(UserWarning, match="some episodes end with 'is_success' in their infos, others do not"):
-        evaluate_team(RandomPolicy(env, seed=0), env, 20)
 
 
 GAME: dict[str, Any] = {"grid_size": 7, "n_treasures": 3, "max_cycles": 6}
