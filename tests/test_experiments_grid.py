@@ -215,18 +215,19 @@ def test_plan_lists_cells_and_totals(capsys: pytest.CaptureFixture[str], tmp_pat
 
 
 def test_plan_counts_what_is_finished(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    config = RunConfig("smoke", {}, 16, 200, 2)
+    config = RunConfig("smoke", {"game_steps": 40}, 2, 40, 2)
     run(EXPERIMENTS["joint"], Selection((0,), ("ippo",), (), ("2", "3")), config, Results(tmp_path), InlineEngine())
     capsys.readouterr()
-    words = ["plan", "joint", "-f", str(tmp_path), "--levels", "2", "3", "--methods", "ippo", "--seeds", "0"]
+    words = ["plan", "joint", "-f", str(tmp_path), "-n", "40", "--episodes", "2", "--eval-freq", "40"]
+    words += ["--levels", "2", "3", "--methods", "ippo", "--seeds", "0"]
     printed = output(capsys, *words, "1")
     assert "cells       4 to train (1 methods x 2 settings x 2 seeds), 2 of them finished" in printed
-    assert "game steps  800 left of 1,600 (400 a cell)" in printed
+    assert "game steps  80 left of 160 (40 a cell)" in printed
     assert re.search(
         r"rate +[\d,]+ game steps/s of one worker in the finished cells\ntime +about 0:\d\d:\d\d \(h:mm:ss\) of one",
         printed,
     )
-    assert "game steps  0 left of 800" in output(capsys, *words)
+    assert "game steps  0 left of 80" in output(capsys, *words)
 
 
 BAD = {
