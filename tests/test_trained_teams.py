@@ -37,7 +37,7 @@ from tests.experiments_jobs import InlineEngine, read_table
 #: Two large updates, and teams after them: seeds play differently.
 OVERRIDES = {"game_steps": 80, "learning_rate": 0.01}
 SMOKE = RunConfig("smoke", OVERRIDES, episodes=TEST_GAMES + 8, eval_freq=80, eval_episodes=2)
-METHODS = ("saf", "ippo", "ippo-separate", "saf-gru", "qplex")
+METHODS = ("saf", "ippo", "saf-gru", "qplex")
 LEVEL = "TeamSupport-c2-h2"
 NAMES = sorted(f"{LEVEL}/{method}" for method in METHODS)
 #: All teams of the repository may take no more.
@@ -94,7 +94,6 @@ def test_a_team_plays_its_games_again(published: Path, method: str) -> None:
     assert len(evaluate_team(model, env, 3).returns) == 3
     assert getattr(model, "exploration_rate", 0.0) == 0.0  # its actions are those that it has learned
     env.close()
-    assert check_team(f"{LEVEL}/{method}", published).endswith(ALL_EQUAL)
     assert f"{TEST_GAMES} games" in check_team(f"{LEVEL}/{method}", published, batches=1)
 
 
