@@ -211,7 +211,7 @@ def test_hyperparameters_that_differ_are_in_the_method_and_repeated_runs_count_o
     given = ["--size", "smoke", "-n", "40", "--eval-freq", "-1", "--seed", "0", "--verbose", "0", "-f", str(tmp_path)]
     zoo_train.main(["--algo", "saf", *given])
     zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
-    zoo_train.main(["--algo", "saf", *given, "-params", "gamma:0.9"])
+    shutil.copytree(tmp_path / "saf" / f"{ENV}_2", tmp_path / "saf" / f"{ENV}_3")
     named = describe(find_runs(tmp_path))
     assert [(one.run.number, one.method) for one in named] == [(1, "saf"), (3, "saf gamma=0.9")]
     with pytest.raises(ValueError, match="has no evaluations"):
