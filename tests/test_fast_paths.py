@@ -116,7 +116,7 @@ def _trained(algorithm: type[Any], policy: str, memory: str | None = None, **kwa
 
 
 _PPO = {"n_steps": 25, "batch_size": 2_000, "n_epochs": 1, "rollout_buffer_class": TeamRolloutBuffer}
-_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 300}
+_QPLEX: dict[str, Any] = {"batch_size": 128, "learning_starts": 350}
 
 
 @pytest.mark.usefixtures("two_threads")
