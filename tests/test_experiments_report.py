@@ -153,7 +153,9 @@ def test_evaluations_have_times_of_their_own() -> None:
 
 
 def test_results_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="has no finished cell of 'joint'; run it first"):
+    with pytest.raises(
+        ValueError, match="has no results of 'joint': expected a folder of cells, or runs"
+    ):
         read_results(tmp_path, "joint")
     with pytest.raises(ValueError, match="unknown experiment 'jont'"):
         read_results(tmp_path, "jont")

@@ -19,6 +19,7 @@ from sb3_saf.experiments.run import run
 from sb3_saf.suites.registry import suites
 from sb3_saf.teams.files import read_json, write_json
 from sb3_saf.training import folders as trained_teams
+from sb3_saf.training.commands import CommandError
 from sb3_saf.training.enjoy import enjoy
 from sb3_saf.training.folders import (
     TEAMS,
@@ -146,7 +147,24 @@ def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypat
     assert len(enjoy(["--team", f"{LEVEL}/saf-gru", "--no-render", "--episodes", "2"]).returns) == 2
     assert len(enjoy(["--team", f"{LEVEL}/saf", "--no-render", "--env-kwargs", "n_agents:5"]).returns) == 32
     models = [str(published / LEVEL / "saf"), str(published / LEVEL / "saf-gru" / WEIGHTS)]
-    assert write_page(["--model", *models, "-o", str(tmp_path / "page.html")]).is_file()
+    page = tmp_path / "page.html"
+    assert write_page(["--model", *models, "-o", str(page)]).is_file()
+    of_other_games = shutil.copytree(published, tmp_path / "teams") / LEVEL / "saf"
+    change(tmp_path / "teams", lambda saved: saved["env_kwargs"].update(coordination=1), f"{LEVEL}/saf")
+    both = ["--model", models[0], str(of_other_games), "-o", str(page)]
+    with pytest.raises(CommandError, match="play one game, but coordination was 2, now 1; choose a level with --env-k"):
+        write_page(both)
+    assert write_page([*both, "--env-kwargs", "coordination:2"]).is_file()
+
+
+def test_a_page_runs_no_code_of_a_team(teams: Path, tmp_path: Path) -> None:
+    team = teams / LEVEL / "saf"
+    change(teams, lambda saved: saved.update(env_wrapper="os.system"), f"{LEVEL}/saf")
+    with pytest.raises(CommandError, match="names could run code"):
+        write_page(["--model", str(team), "-o", str(tmp_path / "page.html")])
+    (team / "run.json").write_text((team / "run.json").read_text() + " ")
+    with pytest.raises(CommandError, match="has changed since the run was finished"):
+        write_page(["--model", str(team), "-o", str(tmp_path / "page.html")])
 
 
 def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -100,7 +100,9 @@ def read_results(folder: str | Path, name: str) -> Frames:
                 raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
             return Frames(tests, curves)
     experiment = results.experiment(name)
-    cells = [] if results.config() is None else requested(experiment, results)
+    if results.config() is None:
+        raise ValueError(f"{folder} has no results of {name!r}: expected a folder of cells, or {RUNS} and {CURVES}")
+    cells = requested(experiment, results)
     tests = frame_of_tests(results, cells)
     if tests.empty:
         raise ValueError(
@@ -288,12 +290,13 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
         }
         content = {**source.description, "versions": versions, "row": {**row, "returns": " ".join(map(repr, returns))}}
         write_json(team / RUN_FILE, content)
+        finish_run(team, **{key: value for key, value in source.finished().items() if key != "files"})
         suite = source.settings.environment.suite
         if suite is not None and suite.is_drawn_from_state:
             page = write_page(["--model", str(team / WEIGHTS), "-o", str(team / "replay.html")])
             if page.stat().st_size > _PAGE_BYTES:
                 page.unlink()
-        finish_run(team, **{key: value for key, value in source.finished().items() if key != "files"})
+            finish_run(team)
     return list(best)
 
 

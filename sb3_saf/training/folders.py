@@ -420,10 +420,15 @@ def find_team(name: str, folder: str | Path | None = None) -> Run:
     known, name = team_names(folder), f"{folder_name(env)}/{method}"
     if name not in known:
         raise unknown_name("team", name, known)
-    run = Run((TEAMS if folder is None else Path(folder)) / name)
+    return published_run((TEAMS if folder is None else Path(folder)) / name)
+
+
+def published_run(folder: Path) -> Run:
+    """Return the run of a team's folder; ExportError if its files have changed, or name code to run."""
+    run = Run(folder)
     if damage := run.damage(WEIGHTS) or run.damage(RUN_FILE):
-        raise ExportError(f"{damage}; restore it from the repository: git checkout {run.folder}")
-    check_runs_no_code(run.description["settings"], run.folder)
+        raise ExportError(f"{damage}; restore it from the repository: git checkout {folder}")
+    check_runs_no_code(run.description["settings"], folder)
     return run
 
 

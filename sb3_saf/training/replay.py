@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_saf.inspection.replay import replay
 from sb3_saf.teams.checks import check_seed, evaluation_seed
+from sb3_saf.teams.files import differences
 from sb3_saf.training.commands import (
     CommandError,
     DefaultsFormatter,
@@ -22,7 +23,7 @@ from sb3_saf.training.commands import (
     user_errors,
 )
 from sb3_saf.training.enjoy import make_policy
-from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run
+from sb3_saf.training.folders import RUN_FILE, WEIGHTS, Run, published_run
 from sb3_saf.training.settings import ALGOS, Settings, load_settings, saved_settings
 from sb3_saf.training.wrappers import load_normalization
 
@@ -61,6 +62,9 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         models = list(dict.fromkeys(options.model))
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
         settings = [_settings_of(path, options) for path in paths]
+        levels = [{"env": own.env_id, **own.env_kwargs} for own in settings]
+        if changed := next(filter(None, (differences(levels[0], level) for level in levels)), ""):
+            raise ValueError(f"models side by side play one game, but {changed}; choose a level with --env-kwargs")
         suite = settings[0].environment.suite
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
         with closing(
@@ -88,7 +92,8 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
         raise CommandError(f"--model {path} is not there")
     if not (path.is_file() and (path.parent / RUN_FILE).is_file()):
         return load_settings(options.algo, options.env or "TeamSupport-v0", options.size, options.env_kwargs)
-    trained = Run(path.parent).settings
+    run = published_run(path.parent) if path.name == WEIGHTS else Run(path.parent)
+    trained = run.settings
     if options.env not in (None, trained.env_id):
         raise CommandError(f"{path} was trained on {trained.env_id}, got --env {options.env}; leave --env out")
     return saved_settings(trained.as_dict(), options.env_kwargs)
