@@ -235,6 +235,8 @@ BAD = {
     ("run",): "name an experiment: ",
     ("run", "--env", "TeamSupport-v0", "a.b"): "several environments need a name before --env",
     ("run", "joint", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",
+    ("run", "..", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",
+    ("run", "cells", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",
     ("run", "joint", "--vary", "a:[1]"): "--vary is for a grid of your own: give its environments with --env",
     ("plan", "joint", "--methods", "safe"): "unknown method 'safe' (did you mean 'saf'?)",
     ("run", "joint", "--tasks", "TeamSuport"): "unknown environment 'TeamSuport' (did you mean 'TeamSupport'",

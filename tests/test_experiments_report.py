@@ -153,12 +153,14 @@ def test_evaluations_have_times_of_their_own() -> None:
 
 
 def test_results_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(
-        ValueError, match="has no results of 'joint': expected a folder of cells, or runs"
-    ):
+    with pytest.raises(ValueError, match="has no results of 'joint': expected a folder of cells, or runs"):
         read_results(tmp_path, "joint")
     with pytest.raises(ValueError, match="unknown experiment 'jont'"):
         read_results(tmp_path, "jont")
+    for name in ("runs.csv", "curves.csv"):
+        (tmp_path / name).write_text("method,task,train_level,level,seed,return_mean,score\nsaf,a,b,b,0,1.0,1.0\n")
+    with pytest.raises(ValueError, match="n_agents, max_return, game_steps is missing"):
+        read_results(tmp_path, "joint")
 
 
 @pytest.fixture

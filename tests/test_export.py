@@ -478,7 +478,12 @@ def test_an_export_without_its_normalisation_warns(tmp_path: Path, monkeypatch: 
 
 def test_files_of_another_kind_are_refused(exports: Callable[[str], Exported], tmp_path: Path) -> None:
     data = (exports("own encoder").folder / "actor.onnx").read_bytes()
-    for content in (data[: len(data) // 2], b"", b"no graph", data.replace(b"sb3_saf", b"sb3_xxx")):
+    for content in (
+        data[: len(data) // 2],
+        b"",
+        b"no graph",
+        *(data.replace(name, b"x" * len(name)) for name in (b"sb3_saf", b"n_agents", b"conversions")),
+    ):
         (tmp_path / "actor.onnx").write_bytes(content)
         with pytest.raises(ValueError, match=r"actor.onnx to be written by sb3_saf.export_actors, got"):
             Actor.load(tmp_path)

@@ -162,6 +162,10 @@ def test_a_page_runs_no_code_of_a_team(teams: Path, tmp_path: Path) -> None:
     change(teams, lambda saved: saved.update(env_wrapper="os.system"), f"{LEVEL}/saf")
     with pytest.raises(CommandError, match="names could run code"):
         write_page(["--model", str(team), "-o", str(tmp_path / "page.html")])
+    change(teams, lambda saved: saved.update(env_wrapper=None), f"{LEVEL}/saf")
+    change(teams, lambda saved: saved["hyperparams"].update(env_wrapper="os.system"), f"{LEVEL}/saf")
+    with pytest.raises(CommandError, match="expected env_wrapper beside the saved hyperparams"):
+        write_page(["--model", str(team), "-o", str(tmp_path / "page.html")])
     (team / "run.json").write_text((team / "run.json").read_text() + " ")
     with pytest.raises(CommandError, match="has changed since the run was finished"):
         write_page(["--model", str(team), "-o", str(tmp_path / "page.html")])

@@ -163,6 +163,15 @@ def test_a_model_is_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str
     damaged = tmp_path / "damaged.zip"
     damaged.write_bytes(first.read_bytes()[:-100])
     assert "damaged.zip does not hold the tensors of a saved model" in failed([*other, "-i", str(damaged)], capsys)
+    other_types = PPO.load(first, device="cpu")
+    other_types.policy.double()
+    other_types.save(damaged)
+    assert "and torch.float64" in failed([*other, "-i", str(damaged), "--algo", "saf"], capsys)
+    other_shapes = PPO.load(first, device="cpu")
+    state = next(iter(other_shapes.policy.optimizer.state.values()))
+    state["exp_avg"] = state["exp_avg"][:1]
+    other_shapes.save(damaged)
+    assert "averages have other shapes" in failed([*other, "-i", str(damaged), "--algo", "saf"], capsys)
     assert "another algorithm's" in failed([*other, "--algo", "saf", "-params", "algorithm:A2C"], capsys)
     pairs = zip(*(PPO.load(path).policy.state_dict().values() for path in (first, second)), strict=True)
     assert all(th.allclose(a.float(), b.float(), atol=1e-5) for a, b in pairs)
@@ -269,8 +278,10 @@ def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest
     write_page(["--model", str(model), "-o", str(tmp_path / "page.html")])
     other = [*given.split(), "-i", str(model)]
     assert "was trained with normalize; give it the same setting" in failed(other, capsys)
-    model.with_suffix(".vecnormalize.npz").unlink()
     words = "cannot read the statistics of normalize"
+    model.with_suffix(".vecnormalize.npz").write_bytes(b"")
+    assert words in failed([*watch, "--load-checkpoint", "40"], capsys, zoo_enjoy.main)
+    model.with_suffix(".vecnormalize.npz").unlink()
     assert words in failed([*watch, "--load-checkpoint", "40"], capsys, zoo_enjoy.main)
     both = ["--model", str(model), str(run / "best_model.zip")]
     assert "a model with normalize is shown alone" in failed(both, capsys, replay_main)

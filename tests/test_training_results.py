@@ -151,6 +151,15 @@ def test_mistakes_in_enjoy_are_one_line(
     assert words in failed(["-f", str(logs), *quiet, *options], capsys, zoo_enjoy.main)
 
 
+def test_another_games_run_is_not_watched_by_this_name(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(logs / "saf" / f"{ENV}_1", tmp_path / "saf" / "TeamSupport-v0_1")
+    (tmp_path / "saf" / "TeamSupport-v0_1" / f"{ENV}.zip").rename(tmp_path / "saf/TeamSupport-v0_1/TeamSupport-v0.zip")
+    line = failed(["-f", str(tmp_path), "--env", "TeamSupport-v0", "--no-render"], capsys, zoo_enjoy.main)
+    assert f"has a run of {ENV}, not of TeamSupport-v0" in line
+
+
 def test_the_error_without_a_run_prints_a_command_that_trains(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -347,7 +356,7 @@ def test_damaged_results_are_one_line(
 ) -> None:
     run = tmp_path / "saf" / f"{ENV}_1"
     shutil.copytree(logs / "saf" / f"{ENV}_1", run)
-    (run / name).write_text("a,b\nsome,text\n")
+    (run / name).write_text("" if name == "evaluations.npz" else "a,b\nsome,text\n")
     if name == "monitor.csv":  # of a run that is not finished
         (run / "curve.csv").unlink()
     source = "evaluation" if name == "evaluations.npz" else "training"

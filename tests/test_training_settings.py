@@ -226,6 +226,7 @@ def test_mistakes_are_refused(change: dict[str, Any], message: str) -> None:
         ("TeamTogeter-v0: {}", "did you mean 'TeamTogether-v0'"),
         ("hecogrid/TeamTogether-v0: {}", "did you mean 'TeamTogether-v0'"),
         ("base: sfa", "did you mean 'saf'"),
+        ("default: {n_envs: !!bool many}", "not valid YAML"),
         ("default: {n_envs: !!python/object/apply:os.getcwd []}", "not valid YAML"),
     ],
 )

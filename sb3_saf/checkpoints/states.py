@@ -155,7 +155,8 @@ def normalization_statistics(layer: VecNormalize) -> dict[str, np.ndarray]:
 def load_normalization_statistics(layer: VecNormalize, arrays: Mapping[str, np.ndarray]) -> None:
     """Restore :func:`normalization_statistics`; ValueError for those of other observations."""
     own = normalization_statistics(layer)
-    if {name: array.shape for name, array in own.items()} != {name: arrays[name].shape for name in arrays}:
+    forms = [{name: (one.shape, one.dtype) for name, one in statistics.items()} for statistics in (own, arrays)]
+    if forms[0] != forms[1]:
         raise ValueError(f"expected statistics {', '.join(own)} of observations of the same shape, got others")
     for name, statistics in _running_statistics(layer).items():
         mean, var, count = (np.array(arrays[f"{name} {part}"]) for part in _STATISTICS)

@@ -85,6 +85,8 @@ def find_method(name: str) -> Method:
 _SHORT: Final = {"coordination": "c", "heterogeneity": "h", "n_agents": "n"}
 #: Values allowed in a folder's name.
 _PLAIN: Final = re.compile(r"[\w.+-]+")
+#: Names in a folder of results.
+_TAKEN: Final = ("cells", "damaged", "settings.json", "unfinished")
 
 
 class Level(NamedTuple):
@@ -216,10 +218,10 @@ def own_experiment(name: str, envs: Sequence[str], vary: Mapping[str, Sequence[A
     :param vary: at most one parameter of the environment, with its values
     :raises ValueError: for names or values not allowed in folder names
     """
-    if not _PLAIN.fullmatch(name) or name in EXPERIMENTS:
+    if not _PLAIN.fullmatch(name) or name[0] == "." or name in {*EXPERIMENTS, *_TAKEN}:
         raise ValueError(
-            f"an experiment of your own needs a name of letters, digits, '.', '_' and '-' that the paper's do not "
-            f"have, got {name!r}; write one before --env"
+            f"an experiment of your own needs a name of letters, digits, '.', '_' and '-' that the paper's and the "
+            f"files beside it do not have, got {name!r}; write one before --env"
         )
     if len(vary) > 1:
         raise ValueError(f"--vary takes one parameter, got {', '.join(vary)}; give the others with --env-kwargs")

@@ -62,6 +62,9 @@ from sb3_saf.training.statistics import FEWEST_SEEDS, Estimate, Floats, mean_ove
 
 RUNS: Final = "runs.csv"
 CURVES: Final = "curves.csv"
+_NEEDED: Final = (
+    *("method", "task", "train_level", "level", "seed", "n_agents", "max_return", "game_steps", "return_mean", "score"),
+)
 #: Largest page of an episode that is published with a team.
 _PAGE_BYTES: Final = 300_000
 #: Settings of a run that are not of its training, or have a column of their own.
@@ -95,7 +98,8 @@ def read_results(folder: str | Path, name: str) -> Frames:
                 # Hashes of digits alone, or with one "e", look like numbers.
                 texts = dict.fromkeys(("game", "training", "commit"), str)
                 tests, curves = (pd.read_csv(path, float_precision="round_trip", dtype=texts) for path in paths)
-                require_columns(tests, ("method", "task", "train_level", "level", "seed", "return_mean", "score"))
+                require_columns(tests, _NEEDED)
+                require_columns(curves, ("method", "task", "level", "seed", "game_steps", "score"))
             except ValueError as error:
                 raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
             return Frames(tests, curves)
@@ -257,7 +261,7 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     :param target: folder of all teams; a team of the same name is replaced
     :param only: pattern of names, such as ``"TeamSupport-*/saf"``
     :return: names of the teams
-    :raises ValueError: if there are none, or their files could run code
+    :raises ValueError: if there are none, or a team could not be loaded without running code
     """
     rows: list[dict[str, Any]] = []
     results = Results(folder)

@@ -93,15 +93,17 @@ class Actor:
             session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
             description = json.loads(session.get_modelmeta().custom_metadata_map["sb3_saf"])
             description["agents"] = tupled(description["agents"])
+            actor = cls(session, description)
+            n_agents, names = actor.n_agents, description["agents"]
         except Exception as error:  # those of onnxruntime have no common class
             raise ValueError(f"expected {path} to be written by sb3_saf.export_actors, got {error!r:.300}") from error
-        n_agents, names = description["n_agents"], description["agents"]
         index: Any = names.index(agent) if names is not None and agent in names else agent
         is_number = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
         if index is not None and not (is_number and 0 <= index < n_agents):
             or_name = "" if names is None else f" or one of {', '.join(map(repr, names))}"
             raise ValueError(f"agent must be a whole number in 0..{n_agents - 1}{or_name}, got {agent!r}")
-        return cls(session, description, None if index is None else int(index))
+        actor.agent = None if index is None else int(index)
+        return actor
 
     @property
     def n_agents(self) -> int:

@@ -186,7 +186,7 @@ class Run:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 return pd.DataFrame({"game_steps": arrays["game_steps"], "score": arrays["results"].mean(axis=1)})
-        except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+        except (EOFError, KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is not what sb3_saf.train writes: {error}") from error
 
 
@@ -359,7 +359,10 @@ def find_model(
         raise ValueError(
             f"{folder} has no {path.name}; --save-freq and --eval-freq of sb3_saf.train save models on the way"
         )
-    return Run(folder), path
+    run = Run(folder)
+    if (of := run.description["settings"].get("env")) != environment.id:
+        raise ValueError(f"{folder} has a run of {of}, not of {environment.id}")
+    return run, path
 
 
 # --- published teams --------------------------------------------------------------------------------------------------

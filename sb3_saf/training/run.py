@@ -31,7 +31,7 @@ from sb3_saf.checkpoints.learning import resumable_learn
 from sb3_saf.checkpoints.states import settings_restored_on_error
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.evaluation import EvaluationResult
-from sb3_saf.export.writer import read_weights
+from sb3_saf.export.writer import load_weights, read_weights
 from sb3_saf.inspection.callback import InspectionCallback
 from sb3_saf.suites.registry import Standing
 from sb3_saf.teams.checks import evaluation_seed
@@ -478,9 +478,13 @@ def load_parameters(model: BaseAlgorithm, path: Path) -> None:
     optimizer = model.policy.optimizer
     settings = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
     try:
+        load_weights(model, path)  # compares types, too
         model.set_parameters(str(path), device=model.device)
         if missing := set(settings[0]) - set(optimizer.param_groups[0]):
             raise ValueError(f"its optimizer has no {', '.join(sorted(missing))}: another algorithm's")
+        for parameter, state in optimizer.state.items():
+            if any(isinstance(one, th.Tensor) and one.ndim and one.shape != parameter.shape for one in state.values()):
+                raise ValueError("its optimizer's averages have other shapes than the weights")
         for group, own in zip(optimizer.param_groups, settings, strict=True):
             group.update(own)
     except Exception as error:  # errors of zipfile, the unpickler and torch have no common class

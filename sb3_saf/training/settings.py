@@ -306,6 +306,8 @@ def saved_settings(saved: Mapping[str, Any], env_kwargs: Mapping[str, Any] | Non
         raise ValueError(f"expected settings that sb3_saf.train has saved; {', '.join(missing)} is missing")
     if not isinstance(saved["hyperparams"], Mapping):
         raise ValueError(f"expected saved hyperparams to map names to values, got {saved['hyperparams']!r}")
+    if wrong := (_OWN_KEYS.keys() - {"policy_kwargs"}) & saved["hyperparams"].keys():
+        raise ValueError(f"expected {', '.join(sorted(wrong))} beside the saved hyperparams, got them among these")
     spec = find_algorithm(saved["algo"], saved.get("algorithm"))
     own = {key: saved[key] for key in _OWN_KEYS if key in saved} | dict(saved["hyperparams"])
     entry = merge(_checked(own, spec, spec, "the saved settings"), {"env_kwargs": env_kwargs or {}})

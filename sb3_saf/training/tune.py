@@ -96,7 +96,7 @@ def sample_overrides(
 def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the parameters of a trial to overrides for ``load_settings``."""
     of_policy = {name: value for name, value in params.items() if name in _POLICY_SEARCH}
-    others = {name: value for name, value in params.items() if name not in _POLICY_SEARCH}
+    others = {name: value for name, value in params.items() if name in {*_SEARCH, _LR_SCHEDULE}}
     if others.pop(_LR_SCHEDULE, None) == _LINEAR:
         others["learning_rate"] = f"lin_{others['learning_rate']}"
     return {**others, "policy_kwargs": of_policy} if of_policy else others

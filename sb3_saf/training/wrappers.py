@@ -9,6 +9,7 @@ the monitor and the joint observation, where each row is one agent's own observa
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -190,5 +191,5 @@ def load_normalization(env: VecEnv, model: Path) -> None:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             load_normalization_statistics(layer, dict(arrays))
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"cannot read the statistics of normalize in {path}: {error}") from error

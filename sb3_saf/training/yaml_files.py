@@ -58,7 +58,7 @@ def load_yaml(text: str, source: str) -> Any:
     """Read YAML, never Python; the ValueError for invalid text names its ``source``."""
     try:
         return yaml.load(text, Loader=_StrictLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:  # of wrong tags, too
         reason = " ".join(str(error).split())
         raise ValueError(f"{source} is not valid YAML: {reason}") from None
 
