@@ -25,9 +25,8 @@ action distribution.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -68,20 +67,6 @@ Replacement = Literal["zero", "shuffled"]
 REPLACEMENTS: Final[tuple[Replacement, ...]] = get_args(Replacement)
 
 
-class StepReading(NamedTuple):
-    """One step of all games, the entries of :class:`EpisodeRecording` without T. What a policy lacks is None."""
-
-    actions: npt.NDArray[Any]
-    values: th.Tensor
-    action_probabilities: th.Tensor | None
-    pool_weights: th.Tensor | None = None
-    pool_actions: th.Tensor | None = None
-    write_attention: th.Tensor | None = None
-    read_attention: th.Tensor | None = None
-    message_strengths: th.Tensor | None = None
-    values_without: Mapping[Replacement, th.Tensor] = MappingProxyType({})
-
-
 def require_our_policy(policy: BasePolicy) -> OurPolicy:
     """Return the policy; ValueError if it is not of this package and cannot be inspected."""
     if isinstance(policy, (TeamPolicy, QPLEXPolicy)):
@@ -111,31 +96,29 @@ class PolicyReader:
         # Messages are replaced at every step, so that the critic's memory depends on them, too.
         self._without = {name: RunningMemory() for name in REPLACEMENTS}
 
-    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> Tensors:
         """
-        Act in one step.
+        Act in one step, and return what the policy has of the entries of :class:`EpisodeRecording`, without T; values
+        with a replaced message are called ``values_`` and the :data:`Replacement`.
 
         :param obs: rows of whole teams, game-major
         :param starts: (B,) whether an episode starts with this step, for policies with memory
         :param action_masks: (B, M) for policies of MaskablePPO
         """
-        arguments = {} if action_masks is None else {"action_masks": action_masks}
-        latents, before = self.policy.extract_features(obs), self._memory.actor
-        with self.policy.remembering(self._memory):
-            actions, values, _ = self.policy(obs, deterministic=self.deterministic, **arguments)
+        policy, arguments = self.policy, {} if action_masks is None else {"action_masks": action_masks}
+        latents, before = policy.extract_features(obs), self._memory.actor
+        with policy.remembering(self._memory):
+            actions, values, _ = policy(obs, deterministic=self.deterministic, **arguments)
             values = values.flatten()
-        if self.policy.actor_memory is not None:
-            latents, _ = self.policy.remember(latents, before, obs[EPISODE_START_KEY] != 0)
-        policy, space = self.policy, self.policy.action_space
+        if policy.actor_memory is not None:
+            latents, _ = policy.remember(latents, before, obs[EPISODE_START_KEY] != 0)
         log_weights, parameters = policy.evaluate_pool(obs, latents, action_masks)
-        is_discrete = isinstance(space, spaces.Discrete)
-        probabilities = mixture_log_probs(log_weights, parameters).exp() if is_discrete else None
-        array = actions.cpu().numpy()
-        clipped = np.clip(array, space.low, space.high) if isinstance(space, spaces.Box) else array  # as SB3 does
-        reading = StepReading(clipped, values, probabilities)
+        reading = {"actions": actions, "values": values}
+        if isinstance(policy.action_space, spaces.Discrete):
+            reading["action_probabilities"] = mixture_log_probs(log_weights, parameters).exp()
         if isinstance(policy.actor, PolicyPool):
-            reading = reading._replace(pool_weights=log_weights.exp(), pool_actions=parameters)
-        return reading if self.source is None else self._with_messages(self.source, reading, obs)
+            reading |= {"pool_weights": log_weights.exp(), "pool_actions": parameters}
+        return reading if self.source is None else reading | self._messages(self.source, obs)
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """
@@ -149,27 +132,26 @@ class PolicyReader:
             values: th.Tensor = self.policy.predict_values(TerminalRow(obs, rows))
         return values.flatten()
 
-    def _with_messages(self, source: SAFCritic, reading: StepReading, obs: Tensors) -> StepReading:
+    def _messages(self, source: SAFCritic, obs: Tensors) -> Tensors:
         policy = self.policy
         _, teams = policy.encode_teams(obs)
         _, exchanged = source.communicate(teams.features, teams.members, teams.active)
         # In rows that are not whole teams in order, equal teams are computed once; expand them to games.
         n_agents = policy.team_spaces.n_agents
         team = th.arange(len(exchanged.read)) if teams.rows is None else teams.rows[::n_agents] // n_agents
-        values_without: dict[Replacement, th.Tensor] = {}
+        values: Tensors = {}
         for name in REPLACEMENTS if len(team) > 1 else REPLACEMENTS[:1]:
             with _other_messages(source, name):
                 if policy.actor_memory is None:
-                    values_without[name] = policy.predict_values(obs).flatten()
+                    values[f"values_{name}"] = policy.predict_values(obs).flatten()
                 else:
                     with policy.remembering(self._without[name]):
-                        values_without[name] = policy(obs, deterministic=True)[1].flatten()
-        return reading._replace(
-            write_attention=exchanged.write_attention[team],
-            read_attention=exchanged.read_attention[team],
-            message_strengths=exchanged.read[team].norm(dim=2).flatten(),
-            values_without=values_without,
-        )
+                        values[f"values_{name}"] = policy(obs, deterministic=True)[1].flatten()
+        return values | {
+            "write_attention": exchanged.write_attention[team],
+            "read_attention": exchanged.read_attention[team],
+            "message_strengths": exchanged.read[team].norm(dim=2).flatten(),
+        }
 
 
 @contextmanager
@@ -197,12 +179,16 @@ class QReader:
         self.policy = policy
         self._state: State | None = None
 
-    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> StepReading:
+    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> Tensors:
         """See :class:`PolicyReader`; ``action_masks`` is unused: legal actions are part of the rows."""
         values, latents, self._state = self.policy.evaluate(obs, self._state, starts)
         best = values.argmax(dim=1)
         probabilities = th.nn.functional.one_hot(best, values.shape[1]).to(values.dtype)
-        reading = StepReading(best.cpu().numpy(), greedy_q_tot(self.policy, obs, values), probabilities)
+        reading = {
+            "actions": best,
+            "values": greedy_q_tot(self.policy, obs, values),
+            "action_probabilities": probabilities,
+        }
         if not isinstance(self.policy.actor, PolicyPool):
             return reading
         # The weights with which training samples heads, and each head's best action with probability 1.
@@ -210,7 +196,7 @@ class QReader:
         of_heads = of_heads.masked_fill(values.isneginf().unsqueeze(1), -th.inf)  # illegal actions
         is_best = of_heads == of_heads.max(dim=2, keepdim=True).values
         pool_actions = th.zeros_like(of_heads).masked_fill(~is_best, -th.inf)
-        return reading._replace(pool_weights=log_weights.exp(), pool_actions=pool_actions)
+        return reading | {"pool_weights": log_weights.exp(), "pool_actions": pool_actions}
 
     def last_values(self, obs: Tensors, rows: npt.NDArray[np.int64]) -> th.Tensor:
         """See :class:`PolicyReader`."""
@@ -401,7 +387,6 @@ class _Recorder:
         self.lengths: list[int] = []
         self.pictures: list[Picture] = []
         self.columns: dict[str, list[npt.NDArray[Any]]] = defaultdict(list)
-        self.without: dict[Replacement, list[Floats]] = defaultdict(list)
 
     def play(self, n_episodes: int, draws: bool) -> None:
         """Play episodes, and collect the results of every step."""
@@ -417,14 +402,12 @@ class _Recorder:
                 self.columns["zones"].append(zones_by_attribute(self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None
             tensors: Any = policy.obs_to_tensor(obs)[0]
-            reading = self.reader.step(tensors, starts, masks)
-            self.columns["actions"].append(reading.actions)
-            for name, value in reading._asdict().items():
-                if isinstance(value, th.Tensor):
-                    self.columns[name].append(value.cpu().numpy())
-            for replacement, values in reading.values_without.items():
-                self.without[replacement].append(values.cpu().numpy())
-            return reading.actions
+            reading = {name: of.cpu().numpy() for name, of in self.reader.step(tensors, starts, masks).items()}
+            if isinstance(policy.action_space, spaces.Box):  # as SB3 does
+                reading["actions"] = reading["actions"].clip(policy.action_space.low, policy.action_space.high)
+            for name, array in reading.items():
+                self.columns[name].append(array)
+            return reading["actions"]
 
         for step in play(self.env, act, n_episodes):
             self._collect(step)
@@ -460,6 +443,7 @@ class _Recorder:
     def recording(self, gamma: float) -> EpisodeRecording:
         """Return the recording of all steps so far."""
         columns: dict[str, Any] = {name: np.stack(column) for name, column in self.columns.items()}
+        replaced = {name: columns.pop(f"values_{name}", None) for name in REPLACEMENTS}
         return EpisodeRecording(
             n_agents=self.n_agents,
             of_team=self.reader.of_team,
@@ -467,7 +451,7 @@ class _Recorder:
             episode_returns=self.returns,
             episode_lengths=self.lengths,
             pictures=self.pictures,
-            values_without={name: np.stack(values) for name, values in self.without.items()},
+            values_without={name: values for name, values in replaced.items() if values is not None},
             **columns,
         )
 
