@@ -80,7 +80,6 @@ def world_of(task: TaskName, params: HECOGridParams) -> World:
         zone_colour=(np.arange(n_zones) * (params.agent_colours == "zone") % len(ZONE_COLOURS)).astype(np.uint8),
         shows_actions=params.agent_colours == "action",
         key_colour=BLUE_INDEX if released else KEY_CARRIER_INDEX,
-        first_colour=BLUE_INDEX,
         spread=np.array(spread, dtype=np.uint64),
         tile=params.view_tile_size,
         atlas=np.concatenate([atlases.reshape(-1), np.zeros(SLACK, dtype=np.uint8)]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hecogrid_envs.constants import Terrain
+from hecogrid_envs.constants import BLUE_INDEX, Terrain
 from hecogrid_envs.core.jit import hot, inlined, kernel
 from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
@@ -40,7 +40,7 @@ def begin(games: Games, world: World, e: int) -> None:
         games.crowd[e, cell] = 0
     for agent in range(world.n_agents):
         arrive(games, e, agent, games.y[e, agent] * world.width + games.x[e, agent])
-        games.colour[e, agent] = world.first_colour if world.released else present_colour(games, world, e, agent, -1)
+        games.colour[e, agent] = BLUE_INDEX if world.released else present_colour(games, world, e, agent, -1)
     redraw(games, world, e)
 
 

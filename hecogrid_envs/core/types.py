@@ -43,7 +43,6 @@ class World(NamedTuple):
     :param zone_colour: (Z,) palette index of an agent
     :param shows_actions: whether an agent's colour tells its last action instead
     :param key_colour: palette index of an agent with a key
-    :param first_colour: palette index of all agents after a reset, or -1 for their present colour
     :param spread: (256,) word whose byte i is 0xFF where bit i of the index is set
     :param tile: t
     :param atlas: (4 * n_codes * t * t * 3,) tiles for viewers facing each direction, and slack for whole chunks
@@ -72,7 +71,6 @@ class World(NamedTuple):
     zone_colour: U8
     shows_actions: bool
     key_colour: int
-    first_colour: int
     spread: U64
     tile: int
     atlas: U8
