@@ -10,11 +10,6 @@ from hecogrid_envs.core.occupancy import arrive, redraw_cell, set_wall_bits
 from hecogrid_envs.core.rng import below
 from hecogrid_envs.core.types import Games, World, whole
 
-_EMPTY = int(Terrain.EMPTY)
-_WALL = int(Terrain.WALL)
-_TREASURE = int(Terrain.TREASURE)
-_KEY = int(Terrain.KEY)
-
 
 @kernel
 def new_level(games: Games, world: World, e: int) -> None:
@@ -49,12 +44,12 @@ def _clear(games: Games, world: World, e: int) -> None:
     """Empty the map inside the outer wall and take all keys from the agents."""
     width = world.width
     for cell in range(width * width):
-        games.terrain[e, cell] = _EMPTY
+        games.terrain[e, cell] = Terrain.EMPTY
     for i in range(width):
-        games.terrain[e, i] = _WALL
-        games.terrain[e, (width - 1) * width + i] = _WALL
-        games.terrain[e, i * width] = _WALL
-        games.terrain[e, i * width + width - 1] = _WALL
+        games.terrain[e, i] = Terrain.WALL
+        games.terrain[e, (width - 1) * width + i] = Terrain.WALL
+        games.terrain[e, i * width] = Terrain.WALL
+        games.terrain[e, i * width + width - 1] = Terrain.WALL
     for agent in range(world.n_agents):
         games.has_key[e, agent] = 0
 
@@ -69,11 +64,11 @@ def _place_objects(games: Games, world: World, e: int) -> None:
         pick = k + below(games.rng, e, n_cells - k)
         cell = cells[pick]
         cells[pick] = cells[k]
-        terrain = _KEY
+        terrain = Terrain.KEY
         if k < world.n_treasures:
-            terrain = _TREASURE
+            terrain = Terrain.TREASURE
         elif k < world.n_treasures + world.n_clutter:
-            terrain = _WALL
+            terrain = Terrain.WALL
         games.terrain[e, (cell // inside + 1) * world.width + cell % inside + 1] = terrain
 
 
@@ -84,7 +79,7 @@ def _place_agent(games: Games, world: World, e: int, agent: int) -> None:
         x = 1 + below(games.rng, e, inside)
         y = 1 + below(games.rng, e, inside)
         ground = games.terrain[e, y * world.width + x]
-        if ground not in (_WALL, _KEY):
+        if ground not in (Terrain.WALL, Terrain.KEY):
             break
     games.x[e, agent] = x
     games.y[e, agent] = y
@@ -98,7 +93,7 @@ def redraw(games: Games, world: World, e: int) -> None:
         games.wall_bits[np.uint64(bits + i)] = 0
     for y in range(world.width):
         for x in range(world.width):
-            if games.terrain[e, np.uint64(y * world.width + x)] == _WALL:
+            if games.terrain[e, np.uint64(y * world.width + x)] == Terrain.WALL:
                 set_wall_bits(games, world, e, x, y)
             redraw_cell(games, world, e, x, y)
     for agent in range(world.n_agents):

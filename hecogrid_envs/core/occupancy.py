@@ -8,9 +8,6 @@ from hecogrid_envs.core.types import Games, World, whole
 from hecogrid_envs.tiles import FIRST_AGENT, FIRST_KEY, FIRST_TERRAIN
 
 _N_COLOURS = len(AGENT_PALETTE)
-_TREASURE = int(Terrain.TREASURE)
-_COLLECTED = int(Terrain.COLLECTED)
-_KEY = int(Terrain.KEY)
 
 
 @inlined
@@ -77,9 +74,9 @@ def count_near(games: Games, world: World, e: int, agent: int, old_x: int, old_y
 def agent_code(ground: int, colour: int, direction: int) -> int:
     """Return the tile code of an agent; ``ground`` is the terrain it stands on."""
     layer = 0
-    if ground == _TREASURE:
+    if ground == Terrain.TREASURE:
         layer = 1
-    elif ground == _COLLECTED:
+    elif ground == Terrain.COLLECTED:
         layer = 2
     return FIRST_AGENT + (layer * _N_COLOURS + colour) * 4 + direction
 
@@ -108,7 +105,7 @@ def redraw_cell(games: Games, world: World, e: int, x: int, y: int) -> None:
     turn, step = 0, 0
     if first >= 0:
         low, turn, step = agent_code(ground, games.colour[e, first], 0), games.direction[e, first] + 3, -1
-    elif ground == _KEY:
+    elif ground == Terrain.KEY:
         low, turn, step = FIRST_KEY, 1, 1
     plane = e * 4 * world.plane_bytes
     for facing in range(4):

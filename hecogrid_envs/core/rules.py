@@ -11,18 +11,6 @@ from hecogrid_envs.core.occupancy import arrive, leave, redraw_cell
 from hecogrid_envs.core.types import Games, World, whole
 from hecogrid_envs.task import DECLARED, Condition
 
-_EMPTY = int(Terrain.EMPTY)
-_WALL = int(Terrain.WALL)
-_TREASURE = int(Terrain.TREASURE)
-_COLLECTED = int(Terrain.COLLECTED)
-_KEY = int(Terrain.KEY)
-
-_LEFT = int(Command.LEFT)
-_RIGHT = int(Command.RIGHT)
-_FORWARD = int(Command.FORWARD)
-_PICKUP = int(Command.PICKUP)
-_DROP = int(Command.DROP)
-
 NumberedCondition = Callable[[int, Games, World, int, int, int, int], bool]
 
 
@@ -53,15 +41,15 @@ def act(games: Games, world: World, e: int, agent: int, action: int) -> None:
     if world.released:
         # Others see the agent as it was when it acted, before its action.
         games.colour[e, agent] = present_colour(games, world, e, agent, action)
-    if command in (_LEFT, _RIGHT):
-        turn = 3 if command == _LEFT else 1
+    if command in (Command.LEFT, Command.RIGHT):
+        turn = 3 if command == Command.LEFT else 1
         games.direction[e, agent] = (games.direction[e, agent] + turn) & 3
         games.sight_known[e, agent] = 0
-    elif command == _FORWARD:
+    elif command == Command.FORWARD:
         _forward(games, world, e, agent)
-    elif command == _PICKUP:
+    elif command == Command.PICKUP:
         _pick_up(games, world, e, agent)
-    elif command == _DROP:
+    elif command == Command.DROP:
         _drop(games, world, e, agent)
     if not world.released:
         games.colour[e, agent] = present_colour(games, world, e, agent, action)
@@ -82,7 +70,7 @@ def _forward(games: Games, world: World, e: int, agent: int) -> None:
     front_x, front_y = _front(games, e, agent)
     front = front_y * world.width + front_x
     ground = games.terrain[e, front]
-    if ground in (_WALL, _KEY):
+    if ground in (Terrain.WALL, Terrain.KEY):
         return
     x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
     leave(games, e, agent, y * world.width + x)
@@ -91,20 +79,20 @@ def _forward(games: Games, world: World, e: int, agent: int) -> None:
     games.y[e, agent] = front_y
     arrive(games, e, agent, front)
     games.sight_known[e, agent] = 0
-    if ground == _TREASURE:
+    if ground == Terrain.TREASURE:
         _try_to_collect(games, world, e, agent, x, y)
 
 
 @inlined
 def _pick_up(games: Games, world: World, e: int, agent: int) -> None:
     x, y = whole(games.x[e, agent]), whole(games.y[e, agent])
-    if games.terrain[e, y * world.width + x] == _TREASURE:
+    if games.terrain[e, y * world.width + x] == Terrain.TREASURE:
         _try_to_collect(games, world, e, agent, x, y)
     front_x, front_y = _front(games, e, agent)
     front = front_y * world.width + front_x
-    if games.terrain[e, front] == _KEY and not games.has_key[e, agent]:
+    if games.terrain[e, front] == Terrain.KEY and not games.has_key[e, agent]:
         games.has_key[e, agent] = 1
-        games.terrain[e, front] = _EMPTY
+        games.terrain[e, front] = Terrain.EMPTY
         redraw_cell(games, world, e, front_x, front_y)
 
 
@@ -112,10 +100,10 @@ def _pick_up(games: Games, world: World, e: int, agent: int) -> None:
 def _drop(games: Games, world: World, e: int, agent: int) -> None:
     front_x, front_y = _front(games, e, agent)
     front = front_y * world.width + front_x
-    nothing_there = games.terrain[e, front] == _EMPTY and games.crowd[e, front] == 0
+    nothing_there = games.terrain[e, front] == Terrain.EMPTY and games.crowd[e, front] == 0
     if games.has_key[e, agent] and nothing_there:
         games.has_key[e, agent] = 0
-        games.terrain[e, front] = _KEY
+        games.terrain[e, front] = Terrain.KEY
         redraw_cell(games, world, e, front_x, front_y)
 
 
@@ -123,5 +111,5 @@ def _drop(games: Games, world: World, e: int, agent: int) -> None:
 def _try_to_collect(games: Games, world: World, e: int, agent: int, old_x: int, old_y: int) -> None:
     """Collect the treasure under an agent if the task's condition holds; (old_x, old_y) is where its action began."""
     if _condition(world.condition, games, world, e, agent, old_x, old_y):
-        games.terrain[e, games.y[e, agent] * world.width + games.x[e, agent]] = _COLLECTED
+        games.terrain[e, games.y[e, agent] * world.width + games.x[e, agent]] = Terrain.COLLECTED
         games.collected_now[e] += 1
