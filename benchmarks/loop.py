@@ -32,7 +32,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecExtractDictObs
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from benchmarks.stages import Stopwatch
+from benchmarks.stages import Stopwatch, small_model
 from sb3_saf import CentralizedValueWrapper, LightEncoder, TeamMonitor, TeamRolloutBuffer, ppo_settings
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.training.settings import load_settings
@@ -183,19 +183,6 @@ def recurrent_models(units: int) -> dict[str, OnPolicyAlgorithm]:
     return {"RecurrentPPO": theirs, **ours}
 
 
-def small_model(algo: str, n_agents: int | None = None, n_games: int | None = None) -> PPO:
-    """Create PPO of the zoo's size ``small``; for any number of agents, with equal rows and density."""
-    overrides, env_kwargs = {} if n_games is None else {"n_envs": n_games}, {}
-    if n_agents is not None:
-        side = max(8, round(15 * (n_agents / 5) ** 0.5))
-        overrides = {"n_envs": max(1, GROWTH_ROWS // n_agents), "n_steps": 50, "n_minibatches": 2}
-        env_kwargs = {"n_agents": n_agents, "grid_size": side, "n_treasures": side * side // 9}
-    settings = load_settings(algo, "TeamSupport-v0", "small", env_kwargs, overrides)
-    model = settings.make_model(settings.make_env(0), 0, device="cpu")
-    assert isinstance(model, PPO)
-    return model
-
-
 def costs(models: Mapping[str, OnPolicyAlgorithm], rounds: int) -> dict[str, Cost]:
     """Measure programs in turns; the first round is a warm-up."""
     spent: dict[str, list[tuple[float, float]]] = {name: [] for name in models}
@@ -226,11 +213,14 @@ def print_table(title: str, costs_by_name: Mapping[str, Cost]) -> None:
 
 
 def print_growth(rounds: int) -> None:
-    """Print the cost by the number of agents."""
+    """Print the cost by the number of agents, with equal rows and density."""
     print("\n| agents | " + " | ".join(f"{algo}, us per agent-step" for algo in ("SAF", "MAPPO")) + " |")
     print("| --- | --- | --- |")
     for n_agents in GROWTH:
-        models = {algo: small_model(algo, n_agents) for algo in ("saf", "mappo")}
+        side = max(8, round(15 * (n_agents / 5) ** 0.5))
+        overrides = {"n_envs": max(1, GROWTH_ROWS // n_agents), "n_steps": 50, "n_minibatches": 2}
+        level = {"n_agents": n_agents, "grid_size": side, "n_treasures": side * side // 9}
+        models = {algo: small_model(algo, overrides, env_kwargs=level) for algo in ("saf", "mappo")}
         by_algo = costs(models, rounds)
         print(
             f"| {n_agents} | " + " | ".join(f"{1e6 * cost.whole:.0f}" for cost in by_algo.values()) + " |", flush=True
@@ -252,12 +242,13 @@ def main() -> None:
         for n_games in options.games:
             print_table(f"{n_games} free games x {N_AGENTS} agents", costs(free_models(n_games), options.rounds))
     if "small" in tables:
-        models = {algo.upper(): small_model(algo) for algo in ("ippo", "mappo", "saf")}
+        models = {algo.upper(): small_model(algo, {}) for algo in ("ippo", "mappo", "saf")}
         print_table("HECOGrid TeamSupport, size small", costs(models, options.rounds))
+    memory_games = {} if options.memory_games is None else {"n_envs": options.memory_games}
     if "memory" in tables:
         for algo in ("mappo", "saf"):
             names = (algo, f"{algo}-gru", f"{algo}-lstm")
-            models = {name: small_model(name, n_games=options.memory_games) for name in names}
+            models = {name: small_model(name, memory_games) for name in names}
             print_table(f"HECOGrid TeamSupport, size small, {algo} with memory", costs(models, options.rounds))
     if "recurrent" in tables:
         for units in options.units:

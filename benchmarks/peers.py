@@ -85,7 +85,7 @@ class Outcome(NamedTuple):
     source: str
 
 
-_KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
+KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
 PEERS: Final = (
     Peer("smax/3m", "JaxMARL's IPPO", "jaxmarl", "3m", "ippo_rnn_smax", 100_000),
     Peer("smax/3m", "JaxMARL's IPPO", "jaxmarl", "3m", "ippo_rnn_smax", 1_000_000),
@@ -93,7 +93,7 @@ PEERS: Final = (
     Peer("overcooked/cramped_room", "JaxMARL's IPPO", "jaxmarl", "cramped_room", "ippo_ff_overcooked", 200_000),
     *(
         Peer(f"overcooked/{layout}", "JaxMARL's IPPO", "jaxmarl", layout, "ippo_ff_overcooked", 5_000_000)
-        for layout in _KITCHENS
+        for layout in KITCHENS
     ),
     *(
         Peer(f"jaxmarl/{_SPREAD}", "JaxMARL's IPPO", "jaxmarl", _SPREAD, "ippo_ff_mpe", game_steps)

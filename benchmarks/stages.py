@@ -112,9 +112,11 @@ SMALL_GAMES: Final[Mapping[int, dict[str, int]]] = {
 PAPER_GAME_STEPS: Final = 10_000_000
 
 
-def small_model(algo: str, n_games: int, device: str) -> PPO:
+def small_model(
+    algo: str, overrides: Mapping[str, Any], device: str = "cpu", env_kwargs: Mapping[str, Any] | None = None
+) -> PPO:
     """Create PPO with the zoo's settings of the size ``small``."""
-    settings = load_settings(algo, "TeamSupport-v0", "small", overrides=SMALL_GAMES[n_games])
+    settings = load_settings(algo, "TeamSupport-v0", "small", env_kwargs, overrides)
     model = settings.make_model(settings.make_env(0), 0, device=device)
     assert isinstance(model, PPO)
     return model
@@ -142,11 +144,11 @@ def paper_model(policy: str, n_games: int, device: str) -> PPO:
 
 SETTINGS: Final[Mapping[str, Callable[[str], PPO]]] = {
     **{
-        f"{algo.upper()}, small, {n_games} games": partial(small_model, algo, n_games)
-        for n_games in SMALL_GAMES
+        f"{algo.upper()}, small, {n_games} games": partial(small_model, algo, overrides)
+        for n_games, overrides in SMALL_GAMES.items()
         for algo in ("saf", "mappo", "ippo")
     },
-    **{f"{algo.upper()}, small, 80 games": partial(small_model, algo, 80) for algo in ("saf-gru", "mappo-gru")},
+    **{f"{algo.upper()}, small, 80 games": partial(small_model, algo, {}) for algo in ("saf-gru", "mappo-gru")},
     "SAF, paper network, 16 games": partial(paper_model, "SAFPolicy", 16),
 }
 #: This size needs a GPU; without one, a rollout takes a minute.

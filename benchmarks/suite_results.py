@@ -19,6 +19,8 @@ from typing import Final, NamedTuple
 import pandas as pd
 
 from benchmarks.paper import add, fill
+from benchmarks.peers import FILE as BASELINES
+from benchmarks.peers import KITCHENS
 from sb3_saf.experiments.cli import main as experiments
 from sb3_saf.experiments.definitions import METHODS as NAMED
 from sb3_saf.experiments.tables import read_results
@@ -27,7 +29,6 @@ from sb3_saf.training.statistics import FEWEST_SEEDS, mean_over_seeds
 
 METHODS: Final = ("saf", "mappo", "ippo")
 SEEDS: Final = (0, 1, 2)
-BASELINES: Final = Path("results", "suites_baselines.csv")
 PAGE: Final = Path("results", "suites.md")
 RAW: Final = Path("results", "field")
 
@@ -66,7 +67,6 @@ class Task(NamedTuple):
         return " ".join([self.env_id, *(param for param in self.params if not param.startswith(_SHAPING))])
 
 
-_KITCHENS: Final = ("cramped_room", "asymm_advantages", "coord_ring", "forced_coord", "counter_circuit")
 #: The cheapest ones first.
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000),
@@ -84,7 +84,7 @@ TASKS: Final = (
     ),
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
     Task("lbf/Foraging-15x15-4p-3f-v3", 5_000_000),
-    *(Task(f"overcooked/{layout}", 5_000_000, params=(f"{_SHAPING}2500000",)) for layout in _KITCHENS),
+    *(Task(f"overcooked/{layout}", 5_000_000, params=(f"{_SHAPING}2500000",)) for layout in KITCHENS),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     *(
         Task(f"smax/{battle}", 10_000_000, settings=("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0"))
