@@ -85,9 +85,8 @@ class Inspection(NamedTuple):
                 n_zones = max(int(zones.max(initial=0)) + 1, len(self.colours or ()))
                 by_zone = numbers.selection_by_group(weights, zones, n_zones)
                 plots["pool/by_zone"] = figures.chosen_by_zone(by_zone, self.colours)
-        write, read = numbers.write_attention(recording), numbers.read_attention(recording)
-        if write is not None and read is not None and recording.write_attention is not None:
-            plots["knowledge_source/attention"] = figures.attention(write, read)
+        if recording.write_attention is not None:
+            plots["knowledge_source/attention"] = figures.attention(**numbers.attentions(recording))
             # The first game up to the end of its first episode.
             game = int(np.flatnonzero(recording.counted_games.any(axis=0))[0])
             ends = recording.ends.reshape(len(recording.ends), -1, recording.n_agents)[:, game].all(axis=1)

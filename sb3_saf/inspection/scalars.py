@@ -186,32 +186,26 @@ def attention_of(weights: Floats) -> Attention:
     return Attention(mean, float((entropy(weights) / np.log(n_own))[has_source].mean()), of_mean)
 
 
-def write_attention(recording: EpisodeRecording) -> Attention | None:
-    """Summarise the attention of slots over agents; None without a knowledge source."""
-    if recording.write_attention is None:
-        return None
-    return attention_of(recording.write_attention[recording.counted_games])
-
-
-def read_attention(recording: EpisodeRecording) -> Attention | None:
-    """Summarise the attention of agents over slots; None without a knowledge source."""
-    if recording.read_attention is None:
-        return None
+def attentions(recording: EpisodeRecording) -> dict[str, Attention]:
+    """Summarise ``write``, slots over agents, and ``read``, agents over slots; none without a knowledge source."""
+    write, read, played = recording.write_attention, recording.read_attention, recording.counted_games
+    if write is None or read is None:
+        return {}
     # Inactive readers are excluded, like queries without sources.
-    takes_part = recording.counted.reshape(*recording.read_attention.shape[:3], 1)
-    return attention_of((recording.read_attention * takes_part)[recording.counted_games])
+    takes_part = recording.counted.reshape(*read.shape[:3], 1)
+    return {"write": attention_of(write[played]), "read": attention_of((read * takes_part)[played])}
 
 
 def knowledge_scalars(recording: EpisodeRecording) -> Scalars:
     """Compute the concentration of writing and reading, and the attention to each slot."""
     scalars: Scalars = {}
-    read = read_attention(recording)
-    for name, attention in (("write", write_attention(recording)), ("read", read)):
-        if attention is not None and attention.entropy is not None and attention.entropy_of_mean is not None:
+    found = attentions(recording)
+    for name, attention in found.items():
+        if attention.entropy is not None and attention.entropy_of_mean is not None:
             scalars[f"knowledge_source/{name}_entropy"] = attention.entropy
             scalars[f"knowledge_source/{name}_entropy_of_mean"] = attention.entropy_of_mean
-    if read is not None:
-        for slot, share in enumerate(np.nanmean(read.mean, axis=0)):
+    if found:
+        for slot, share in enumerate(np.nanmean(found["read"].mean, axis=0)):
             scalars[f"knowledge_source/read/slot_{slot}"] = float(share)
     return scalars
 
