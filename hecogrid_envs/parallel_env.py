@@ -269,7 +269,7 @@ class HECOGridEnv(ParallelEnv[str, npt.NDArray[np.uint8], int]):
             from hecogrid_envs.text import render_text
 
             zones = self.params.zone_of_column() if self.params.heterogeneity > 1 else None
-            return render_text(self.get_state(), zones=zones, step=self.n_steps, collected=self.collected)
+            return render_text(self.get_state(), self.n_steps, self.collected, zones)
         if self.render_mode == "rgb_array":
             return self.picture()
         from hecogrid_envs.play import HumanWindow

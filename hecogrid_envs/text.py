@@ -46,22 +46,19 @@ _PAGE_WIDTH: Final = 100
 
 def render_text(
     state: Mapping[str, Any],
-    *,
+    step: int,
+    collected: int,
     zones: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
-    step: int | None = None,
-    collected: int | None = None,
 ) -> str:
     """
     Write a state as text.
 
-    :param zones: (W,) zone of each column, written above the map as digits and letters
     :param step: game steps so far
+    :param collected: treasures so far
+    :param zones: (W,) zone of each column, written above the map as digits and letters
     :return: lines, without a final newline
     """
-    lines = []
-    known = [f"{name} {value}" for name, value in (("step", step), ("collected", collected)) if value is not None]
-    if known:
-        lines.append("  ".join(known))
+    lines = [f"step {step}  collected {collected}"]
     if zones is not None:
         lines.append("".join(_ZONE_DIGITS[int(zone) % len(_ZONE_DIGITS)] for zone in zones))
     treasures = np.asarray(state["treasures"])
