@@ -237,23 +237,21 @@ class PlayedStep(NamedTuple):
     One step of all games.
 
     :param observations: of the B rows, in which the agents acted
-    :param actions: (B, ...)
-    :param following: observations after the step
     :param rewards: (B,) as the outermost wrapper gives them
     :param dones: (B,) bool
     :param infos: of the B rows
     :param ended: (E,) bool, games whose episode ended with this step
     :param counted: (E,) bool, games whose episode counts: each plays its share of the episodes
+    :param finished: (E,) bool, games whose episode counts and ended with this step, not cut short
     """
 
     observations: Any
-    actions: Array
-    following: Any
     rewards: Array
     dones: npt.NDArray[np.bool_]
     infos: list[dict[str, Any]]
     ended: npt.NDArray[np.bool_]
     counted: npt.NDArray[np.bool_]
+    finished: npt.NDArray[np.bool_]
 
 
 def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
@@ -272,8 +270,7 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
     starts, lengths = np.ones(env.num_envs, dtype=np.bool_), np.zeros(n_games, dtype=np.int64)
     try:
         while remaining.any():
-            actions = act(observations, starts)
-            following, rewards, row_dones, infos = env.step(actions)
+            following, rewards, row_dones, infos = env.step(act(observations, starts))
             dones = np.asarray(row_dones, dtype=np.bool_)
             ended = team_dones(dones, n_agents, alone=True)
             lengths = np.where(ended, 0, lengths + 1)
@@ -284,9 +281,10 @@ def play(env: VecEnv, act: Act, n_episodes: int) -> Iterator[PlayedStep]:
                     UserWarning,
                     stacklevel=3,
                 )
-            yield PlayedStep(observations, actions, following, rewards, dones, infos, ended, remaining > 0)
-            whole = [ended[game] and STAGGERED not in infos[game * n_agents] for game in range(n_games)]
-            remaining = np.maximum(remaining - whole, 0)
+            counted, is_whole = remaining > 0, np.array([STAGGERED not in info for info in infos[::n_agents]])
+            finished = ended & counted & is_whole
+            yield PlayedStep(observations, rewards, dones, infos, ended, counted, finished)
+            remaining = remaining - finished
             observations, starts = following, dones
     finally:  # whoever trains on these games holds observations of episodes that are gone
         if (joint := unwrap_vec_wrapper(env, CentralizedValueWrapper)) is not None:
@@ -426,7 +424,7 @@ def evaluate_team(
             info, reward, done = infos[0], float(rewards[i].sum() * share), bool(step.ended[i])
             if callback is not None:
                 callback(locals(), globals())
-            if not done or STAGGERED in info:
+            if not step.finished[i]:
                 continue
             episode = {"r": returns_now[i].sum(), "l": lengths_now[i], "agents": returns_now[i].tolist()}
             if monitored:

@@ -51,7 +51,6 @@ from sb3_saf.teams.rows import (
     ACTIVE_KEY,
     EPISODE_START_KEY,
     OBS_KEY,
-    STAGGERED,
     TERMINAL_OBSERVATION,
     TRUNCATED,
     TerminalRow,
@@ -432,12 +431,10 @@ class _Recorder:
         columns["last_values"].append(_last_values(self.reader, ends, step.infos, n_agents))
         if self.keeps_observations:
             columns["observations"].append(np.array(step.observations[OBS_KEY]))
-        is_cut = np.array([STAGGERED in info for info in step.infos[::n_agents]])
-        finished = step.ended & step.counted & ~is_cut
         self.returns_now += of_teams
         self.lengths_now += 1
-        self.returns += self.returns_now[finished].tolist()
-        self.lengths += self.lengths_now[finished].tolist()
+        self.returns += self.returns_now[step.finished].tolist()
+        self.lengths += self.lengths_now[step.finished].tolist()
         self.returns_now[step.ended], self.lengths_now[step.ended] = 0, 0
 
     def recording(self, gamma: float) -> EpisodeRecording:
