@@ -380,7 +380,7 @@ def test_values_of_vdn_are_sums_of_best_values_of_those_who_take_part() -> None:
     env = telling_env()
     policy = make_qplex(env, mixer="vdn").policy
     obs = rows_of(env)
-    view = QReader(policy).step(obs, np.ones(12, dtype=bool))
+    view = QReader(policy).step(obs)
     best = policy.own_q_values(obs).max(dim=1).values.view(4, 3)
     best[:, 2] = 0  # joins later
     np.testing.assert_allclose(view["values"].view(4, 3), best.sum(dim=1, keepdim=True).expand(4, 3), rtol=1e-6)

@@ -95,13 +95,12 @@ class PolicyReader:
         # Messages are replaced at every step, so that the critic's memory depends on them, too.
         self._without = {name: RunningMemory() for name in REPLACEMENTS}
 
-    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> Tensors:
+    def step(self, obs: Tensors, action_masks: Bools | None = None) -> Tensors:
         """
         Act in one step, and return what the policy has of the entries of :class:`EpisodeRecording`, without T; values
         with a replaced message are called ``values_`` and the :data:`Replacement`.
 
         :param obs: rows of whole teams, game-major
-        :param starts: (B,) whether an episode starts with this step, for policies with memory
         :param action_masks: (B, M) for policies of MaskablePPO
         """
         policy, arguments = self.policy, {} if action_masks is None else {"action_masks": action_masks}
@@ -178,9 +177,9 @@ class QReader:
         self.policy = policy
         self._state: State | None = None
 
-    def step(self, obs: Tensors, starts: Bools, action_masks: Bools | None = None) -> Tensors:
+    def step(self, obs: Tensors, action_masks: Bools | None = None) -> Tensors:
         """See :class:`PolicyReader`; ``action_masks`` is unused: legal actions are part of the rows."""
-        values, latents, self._state = self.policy.evaluate(obs, self._state, starts)
+        values, latents, self._state = self.policy.evaluate(obs, self._state)
         best = values.argmax(dim=1)
         probabilities = th.nn.functional.one_hot(best, values.shape[1]).to(values.dtype)
         reading = {
@@ -394,14 +393,14 @@ class _Recorder:
         has_zones = self.env.has_attr("agent_zones")
         is_first = draws and n_episodes >= len(self.lengths_now)  # else the first game may count no episode
 
-        def act(obs: Any, starts: Bools) -> npt.NDArray[Any]:
+        def act(obs: Any, _: Bools) -> npt.NDArray[Any]:
             if is_first and (frame := picture(self.env)) is not None:
                 self.pictures.append(frame)
             if has_zones:
                 self.columns["zones"].append(zones_by_attribute(self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None
             tensors: Any = policy.obs_to_tensor(obs)[0]
-            reading = {name: of.cpu().numpy() for name, of in self.reader.step(tensors, starts, masks).items()}
+            reading = {name: of.cpu().numpy() for name, of in self.reader.step(tensors, masks).items()}
             if isinstance(policy.action_space, spaces.Box):  # as SB3 does
                 reading["actions"] = reading["actions"].clip(policy.action_space.low, policy.action_space.high)
             for name, array in reading.items():
