@@ -123,12 +123,6 @@ class GameStepsCallback(BaseCallback):
 
     only_shows = True  # has no state in checkpoints
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._n_agents: int | None = None
-        self._first_step = 0
-        self._started = 0.0
-
     def _init_callback(self) -> None:
         check_training(self.model)
 
@@ -430,7 +424,6 @@ class EntropySchedule(BaseCallback):
         if isinstance(end, bool) or not isinstance(end, (int, float)) or not 0 <= end < math.inf:
             raise ValueError(f"end must be a number of at least 0, got {end!r}")
         self.end = end
-        self._start = 0.0
 
     def _init_callback(self) -> None:
         found = getattr(self.model, "ent_coef", None)
