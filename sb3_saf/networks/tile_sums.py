@@ -97,12 +97,8 @@ def used_codes(views: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     :return: codes (U,) int64, increasing, and the index in them of each tile's code, (K, T) int64
     """
     array = (views.long() if views.is_floating_point() else views).numpy()
-    seen = np.zeros(int(array.max()) + 1 if array.size else 0, dtype=np.bool_)
-    _mark(array, seen)
-    codes = np.flatnonzero(seen)
-    number = np.zeros(len(seen), dtype=np.int64)
-    number[codes] = np.arange(len(codes))
-    return th.from_numpy(codes), th.from_numpy(number[array])
+    seen = np.bincount(array.reshape(-1)) > 0
+    return th.from_numpy(np.flatnonzero(seen)), th.from_numpy((seen.cumsum() - 1)[array])
 
 
 def rectified_sums(views: th.Tensor, table: th.Tensor, bias: th.Tensor, places: Places) -> th.Tensor:
@@ -178,12 +174,6 @@ def _flat(tensor: th.Tensor) -> npt.NDArray[Any]:
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
 # Arrays are flat and indices unsigned: numba then omits the check for negative indices, and loops are vectorised.
-
-
-@cached()
-def _mark(views: npt.NDArray[Any], seen: npt.NDArray[np.bool_]) -> None:
-    for code in views.flat:
-        seen[code] = True
 
 
 @cached()
