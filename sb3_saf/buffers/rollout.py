@@ -53,7 +53,6 @@ class Step:
     :param actor: (B, Ma) the actor's memory before the step
     :param critic: (E U, Mc) the critic's memory before the step, if it has one; known when values are computed
     :param values: (B, 1) values, as soon as they are computed
-    :param n_games: E, for policies with memory
     """
 
     obs: dict[str, th.Tensor]
@@ -62,7 +61,6 @@ class Step:
     actor: th.Tensor | None = None
     critic: th.Tensor | None = None
     values: th.Tensor | None = None
-    n_games: int = 0
 
     @classmethod
     def of(cls, obs: th.Tensor | Mapping[str, th.Tensor], encoded: Encoded) -> Step:
@@ -70,12 +68,6 @@ class Step:
         entries = {} if isinstance(obs, th.Tensor) else obs
         own = encoded.own._replace(observations=encoded.own.features.new_empty(0))
         return cls({key: entries[key] for key in (AGENT_KEY, ACTIVE_KEY) if key in entries}, encoded._replace(own=own))
-
-    @property
-    def memory(self) -> th.Tensor | None:
-        """Memory of the games before the step, (E, M): that of all agents, then the critic's."""
-        parts = [part.reshape(self.n_games, -1) for part in (self.actor, self.critic) if part is not None]
-        return th.cat(parts, dim=1) if parts else None
 
 
 #: Maps the critic's inputs of several steps to the values of each, (B, 1).
@@ -332,7 +324,8 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self._returns = RolloutReturns(np.zeros(0), self._agents[:0])
         self._later: list[tuple[int, LaterValues]] = []
         self._waiting[id(observation_space)] = self
-        #: (T / L, E, M), the memory of games before each sequence, of policies that have one.
+        #: (T / L, E, M), the memory of games before each sequence, of policies that have one: that of all agents,
+        #: then the critic's.
         self.memories: th.Tensor | None = None
         super().__init__(buffer_size, observation_space, action_space, device, gae_lambda, gamma, n_envs)
 
@@ -463,9 +456,11 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             for position, values in zip(positions, compute_together(steps), strict=True):
                 self.values[position] = values.reshape(-1).cpu().numpy()
         if self._later:  # not in a second call, after a callback has changed rewards
-            cuts = [value.step.memory for _, value in self._later[:: self.sequence_length]]
-            memories = [memory for memory in cuts if memory is not None]
-            self.memories = th.stack(memories) if memories else None
+            cuts = [value.step for _, value in self._later[:: self.sequence_length]]
+            of_actor = [step.actor for step in cuts if step.actor is not None]
+            of_critic = [step.critic for step in cuts if step.critic is not None]
+            parts = [th.stack(part).view(len(cuts), self.n_games, -1) for part in (of_actor, of_critic) if part]
+            self.memories = th.cat(parts, dim=2) if parts else None
             self._later.clear()
         counted = np.ones((self.buffer_size, self.n_envs), dtype=np.bool_)
         if self.active is not None:

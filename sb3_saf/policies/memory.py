@@ -174,7 +174,6 @@ class RememberingPolicy(TeamRowsPolicy):
                 self.running.critic = features.new_zeros(n_states, critic.memory.state_dim)
         step = Step.of(obs, encoded)
         step.starts, step.actor = self._starts(obs), self.running.actor
-        step.n_games = n_rows // self.team_spaces.n_agents
         if critic is not None:
             if encoded.teams is None or encoded.teams.rows is not None:
                 raise ValueError("expected the rows of whole teams in index order, which a critic with memory reads")
