@@ -410,14 +410,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
 
     def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
         """Return an entry that all rows of a game share, once per game: (B, ...) -> (E, ...)."""
-        expected = (self.n_envs, *stored.shape[2:])
-        rows = np.asarray(obs[key])
-        if rows.shape != expected or not np.can_cast(rows.dtype, stored.dtype, "same_kind"):
-            raise ValueError(
-                f"expected {key!r} of shape {expected} and dtype {stored.dtype}, got {rows.shape} and {rows.dtype}; "
-                "fill the buffer from the environment that it was made for"
-            )
-        by_game = rows.reshape(self.n_games, self.n_agents, *stored.shape[2:])
+        by_game = np.asarray(obs[key]).reshape(self.n_games, self.n_agents, *stored.shape[2:])
         differs = by_game[:, 0] != by_game[:, self.pos % self.n_agents]
         if differs.any():
             game = int(np.flatnonzero(differs.reshape(self.n_games, -1).any(axis=1))[0])
