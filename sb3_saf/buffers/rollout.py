@@ -504,10 +504,9 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all; inactive rows
             are omitted
         :return: minibatches of whole teams: rows of one team are consecutive and in index order
-        :raises ValueError: if the buffer is not full, or no agent was ever active
+        :raises ValueError: if no agent was ever active
         """
-        if not self.full:
-            raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
+        assert self.full
         # Team steps with at least one active agent, each ``step * E + game``.
         playing = np.arange(self.buffer_size * self.n_games)
         if self.active is not None:
