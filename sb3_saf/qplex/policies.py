@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, get_args
 
@@ -218,9 +218,6 @@ class QPLEXPolicy(TeamRowsPolicy):
         self._read_rows_of(observation_space, action_space, encode_once, chunk_size)
         if optimizer_kwargs is None and optimizer_class is th.optim.RMSprop:
             optimizer_kwargs = {"alpha": 0.99, "eps": 1e-5}
-        names = {field.name for field in fields(self.parts_class)}
-        if unknown := [name for name in kwargs if name not in names]:
-            raise TypeError(f"{type(self).__name__} takes no argument {unknown[0]!r}")
         self.parts = self.parts_class(**kwargs)
         super().__init__(
             observation_space,
