@@ -80,11 +80,11 @@ class MAPPOParts(TeamParts):
     @property
     def value_input(self) -> CriticInput:
         """Input of the critic."""
-        return self.critic_input or "team"
+        return self.critic_input or self.value_inputs[0]
 
     @property
     def value_inputs(self) -> tuple[CriticInput, ...]:
-        """Possible inputs of the critic."""
+        """Possible inputs of the critic, the default first."""
         return "team", "mean", "state"
 
     def critic(self, spec: NetworkSpec) -> OwnValueHead | TeamCritic | StateCritic:

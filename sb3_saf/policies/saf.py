@@ -117,14 +117,9 @@ class SAFParts(MAPPOParts):
         object.__setattr__(self, "projection_arch", tuple(self.projection_arch))
 
     @property
-    def value_input(self) -> CriticInput:
-        """See :class:`MAPPOParts`."""
-        return self.critic_input or ("own" if self.knowledge_source else "team")
-
-    @property
     def value_inputs(self) -> tuple[CriticInput, ...]:
         """See :class:`MAPPOParts`."""
-        return ("own", "team") if self.knowledge_source else ("own", "team", "mean")
+        return ("own", "team") if self.knowledge_source else ("team", "mean", "own")
 
     def actor(self, spec: NetworkSpec) -> ActorNetwork:
         """Make the policy pool, or MAPPO's actor for a single policy."""
