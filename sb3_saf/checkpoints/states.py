@@ -99,15 +99,8 @@ def environment_state(venv: VecEnv, with_games: bool = True) -> list[Tree]:
     :raises CheckpointError: naming a layer without a state, and a fix
     """
     *wrappers, games = layers(venv)
-    if with_games:
-        return [_layer_state(layer) for layer in (*wrappers, games)]
-    states: list[Tree] = []
-    for layer in wrappers:
-        try:
-            states.append(_layer_state(layer))
-        except CheckpointError:
-            states.append(None)
-    return [*states, None]
+    states = [_layer_state(layer, is_needed=with_games) for layer in wrappers]
+    return [*states, _layer_state(games, is_needed=True) if with_games else None]
 
 
 def _is_stateful(layer: VecEnv) -> TypeGuard[Stateful]:
@@ -115,7 +108,7 @@ def _is_stateful(layer: VecEnv) -> TypeGuard[Stateful]:
     return issubclass(type(layer), Stateful)
 
 
-def _layer_state(layer: VecEnv) -> Tree:
+def _layer_state(layer: VecEnv, is_needed: bool) -> Tree:
     if _is_stateful(layer):
         return dict(layer.checkpoint_state())
     if isinstance(layer, VecNormalize):
@@ -123,6 +116,8 @@ def _layer_state(layer: VecEnv) -> Tree:
         return {**last, "statistics": normalization_statistics(layer)}
     if isinstance(layer, _WITHOUT_STATE):
         return {}
+    if not is_needed:
+        return None
     raise CheckpointError(
         f"{type(layer).__name__} cannot give the state of its games, so a run on it cannot be resumed exactly; "
         "HECOGrid with backend='native' can, and a VecEnv or wrapper of your own with the methods "
