@@ -55,8 +55,6 @@ from sb3_saf.teams.files import (
 )
 from sb3_saf.teams.vec_env import require_n_agents
 
-_NAME: Final = re.compile(r"checkpoint-(\d{12,})\.ckpt")
-
 
 class Loaded(NamedTuple):
     """A checkpoint that was read."""
@@ -80,10 +78,7 @@ class CheckpointFolder:
 
     def checkpoints(self) -> list[Path]:
         """Return the files of all checkpoints, newest first."""
-        if not self.path.is_dir():
-            return []
-        files = [(int(match[1]), path) for path in self.path.iterdir() if (match := _NAME.fullmatch(path.name))]
-        return [path for _, path in sorted(files, reverse=True) if path.is_file()]
+        return sorted(self.path.glob(f"checkpoint-{12 * '[0-9]'}.ckpt"), reverse=True)
 
     def write(self, content: Callable[[BinaryIO], object], game_steps: int) -> Path:
         """
