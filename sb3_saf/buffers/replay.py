@@ -297,7 +297,7 @@ class TeamReplayBuffer(ReplayBuffer):
         Draw single steps uniformly with replacement.
 
         :param batch_size: G, team steps
-        :param env: must be None; normalise below ``CentralizedValueWrapper``
+        :param env: unused: QPLEX does not train on VecNormalize
         """
         steps, games = self._draw(self.size(), batch_size)
         return self._get_samples(steps * self.n_games + games, env)
@@ -356,8 +356,6 @@ class TeamReplayBuffer(ReplayBuffer):
 
         :param batch_inds: (G,) each is ``step * E + game``, steps counted from the oldest
         """
-        if env is not None:
-            raise ValueError("TeamReplayBuffer does not undo VecNormalize; scale observations in the game")
         steps, games = np.divmod(batch_inds, self.n_games)
         slots = self.slots(steps)
         now = {key: array[slots, games] for key, array in self.seen.items()}
