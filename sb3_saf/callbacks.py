@@ -25,7 +25,7 @@ from torch.utils.hooks import RemovableHandle
 
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.policies.rows import TeamRowsPolicy
-from sb3_saf.teams.checks import NonFiniteError, SettingsError
+from sb3_saf.teams.checks import NonFiniteError, SettingsError, check_hears_rollouts
 from sb3_saf.teams.files import atomic_file
 from sb3_saf.teams.rows import TEAM_KEY, TEAM_KEYS
 from sb3_saf.teams.vec_env import agent_names, check_other_games, find_n_agents, layers, require_n_agents
@@ -203,6 +203,7 @@ class TeamEvalCallback(EvalCallback):
         self.seconds = 0.0
 
     def _init_callback(self) -> None:
+        check_hears_rollouts(self)
         require_n_agents(self.training_env)
         check_training(self.model)
         show_game_steps(self.model)
@@ -426,6 +427,7 @@ class EntropySchedule(BaseCallback):
         self.end = end
 
     def _init_callback(self) -> None:
+        check_hears_rollouts(self)
         found = getattr(self.model, "ent_coef", None)
         if not isinstance(found, (int, float)):
             raise SettingsError(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import A2C, PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EveryNTimesteps
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
@@ -214,6 +214,17 @@ def test_successes_are_those_of_teams_also_where_agents_end_alone() -> None:
     assert model.ep_success_buffer is not None and model.ep_info_buffer is not None
     assert len(model.ep_success_buffer) == len(model.ep_info_buffer) == 4
     assert list(model.ep_success_buffer) == [True, False, True, False]
+
+
+@pytest.mark.parametrize("name", ["TeamEvalCallback", "TeamCheckpointCallback", "EntropySchedule"])
+def test_callbacks_that_would_hear_of_steps_only_are_refused(name: str, tmp_path: Path) -> None:
+    callback = {
+        "TeamEvalCallback": lambda: sb3_saf.TeamEvalCallback(games(1), eval_freq=1, verbose=0),
+        "TeamCheckpointCallback": lambda: sb3_saf.TeamCheckpointCallback(tmp_path, every_game_steps=1),
+        "EntropySchedule": lambda: sb3_saf.EntropySchedule(0.001),
+    }[name]()
+    with pytest.raises(ValueError, match=f"{name} must hear of rollouts, which EveryNTimesteps does not pass on"):
+        ppo().learn(1, EveryNTimesteps(1, callback))
 
 
 @pytest.mark.parametrize("backend", ["native", "supersuit"])

@@ -15,7 +15,12 @@ from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+)
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import nn
@@ -342,7 +347,8 @@ def test_any_features_extractor_gets_the_own_space_and_what_sb3_prepares() -> No
 
 
 @pytest.mark.parametrize(
-    ("extractor", "own"), [(CombinedExtractor, VECTOR), (NatureCNN, CodeSpace()), (NatureCNN, PICTURE)]
+    ("extractor", "own"),
+    [(CombinedExtractor, VECTOR), (NatureCNN, CodeSpace()), (FlattenExtractor, CodeSpace()), (NatureCNN, PICTURE)],
 )
 def test_an_extractor_for_another_space_is_refused_with_those_that_fit(
     extractor: type[BaseFeaturesExtractor], own: spaces.Space[Any]

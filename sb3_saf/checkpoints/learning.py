@@ -42,7 +42,13 @@ from sb3_saf.checkpoints.states import (
     software,
 )
 from sb3_saf.envs.game_copies import ForeignGamesError, check_signatures, pickled_games, sign_games
-from sb3_saf.teams.checks import CheckpointError, DamagedCheckpointError, NonFiniteError, check_count
+from sb3_saf.teams.checks import (
+    CheckpointError,
+    DamagedCheckpointError,
+    NonFiniteError,
+    check_count,
+    check_hears_rollouts,
+)
 from sb3_saf.teams.files import (
     Tree,
     atomic_file,
@@ -210,6 +216,7 @@ class TeamCheckpointCallback(BaseCallback):
         self._releases = True
 
     def _init_callback(self) -> None:
+        check_hears_rollouts(self)
         require_resumable(self.model)
         require_n_agents(self.training_env)
         show_game_steps(self.model)

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -75,6 +75,8 @@ class TeamRowsPolicy(BasePolicy):
         """
         own, kind = self.team_spaces.own, self.features_extractor_class
         try:
+            if hasattr(own, "atlas") and issubclass(kind, FlattenExtractor):
+                raise RuntimeError("it would read tile codes as magnitudes")
             return kind(own, **self.features_extractor_kwargs)
         except (AssertionError, AttributeError, RuntimeError) as error:
             raise ValueError(

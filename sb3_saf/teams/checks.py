@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from stable_baselines3.common.callbacks import BaseCallback
 
 #: Largest seed of a run: the limit of NumPy's global generator, which SB3 seeds.
 MAX_SEED: Final = 2**32 - 1
@@ -107,6 +108,16 @@ class ExportError(ValueError):
 
 class SettingsError(ValueError):
     """Raised for settings that do not fit the model."""
+
+
+def check_hears_rollouts(callback: BaseCallback) -> None:
+    """Check that a callback is not within another one, which passes on steps only; otherwise raise SettingsError."""
+    if callback.parent is not None:
+        within = type(callback.parent).__name__
+        raise SettingsError(
+            f"{type(callback).__name__} must hear of rollouts, which {within} does not pass on: give it to learn "
+            "itself, alone or in a list"
+        )
 
 
 class NonFiniteError(ValueError):
