@@ -225,6 +225,7 @@ def test_callbacks_that_would_hear_of_steps_only_are_refused(name: str, tmp_path
     }[name]()
     with pytest.raises(ValueError, match=f"{name} must hear of rollouts, which EveryNTimesteps does not pass on"):
         ppo().learn(1, EveryNTimesteps(1, callback))
+    ppo().learn(1, callback)
 
 
 @pytest.mark.parametrize("backend", ["native", "supersuit"])

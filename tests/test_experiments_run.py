@@ -414,6 +414,12 @@ def write(content: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(content)
 
 
+def relisted(path: Path) -> None:
+    """Replace a return by NaN, also in the list of files: as if the games had paid it."""
+    edited(plays=with_last_return(path, float("nan")))(path)
+    finish_run(path.parents[1])
+
+
 def with_last_return(path: Path, value: float) -> list[dict[str, Any]]:
     """Return the tests of a file with another last return."""
     *others, last = read_json(path)["plays"]
@@ -429,6 +435,7 @@ DAMAGE: dict[str, Any] = {
     "finished.json nested": ("finished.json", write("[" * 100_000)),
     "finished.json missing": ("finished.json", Path.unlink),
     "mean edited": ("tests/c2-h2.json", edited(return_mean=99.0)),
+    "returns not finite": ("tests/c2-h2.json", relisted),
     "test missing": ("tests/c2-h2.json", Path.unlink),
 }
 

@@ -295,7 +295,7 @@ class TestWhatCounts:
         env = make_team_env(
             "TeamSupport", 4, seed=0, stagger=True, n_agents=3, grid_size=8, n_treasures=6, max_cycles=8
         )
-        policy = hand_made(IPPOPolicy, env)
+        policy = IPPOPolicy(env.observation_space, env.action_space, lambda _: 0.0)
         game = record_episodes(policy, env, 8, seed=3, deterministic=True)
         env.seed(3)
         assert game.episode_lengths == [8] * 8

@@ -158,6 +158,8 @@ def test_sequences_are_consecutive_and_know_where_episodes_start() -> None:
 
 def test_rows_that_are_no_teams_are_refused() -> None:
     buffer, story = make_buffer(), Story()
+    with pytest.raises(ValueError, match="at least one step"):
+        buffer.sample(3)
     rows = story.rows(story.now)
     rest: Any = (np.zeros(6), np.zeros(6), np.zeros(6), [{}] * 6)
     with pytest.raises(ValueError, match="game-major, then agent"):
@@ -168,10 +170,26 @@ def test_rows_that_are_no_teams_are_refused() -> None:
         TeamReplayBuffer(10, TeamSpaces(OWN, 2).to_dict_space(), spaces.Discrete(2), n_envs=3)
 
 
+def test_teams_that_never_take_part_are_refused() -> None:
+    buffer, story = make_buffer(has_active=True), Story()
+    rest: Any = (np.zeros(6, dtype=int), np.zeros(6), np.zeros(6), [{}] * 6)
+    rows = story.rows(story.now)
+    dead = {**rows, "active": np.zeros((6, N_AGENTS), dtype=np.int8)}
+    buffer.add(dead, dead, *rest)
+    with pytest.raises(ValueError, match=r"expected agents that take part, got none in 1 steps of 3 games"):
+        buffer.sample(3)
+    copy = make_buffer(has_active=True)
+    copy.load_checkpoint_state(buffer.checkpoint_state())
+    with pytest.raises(ValueError, match="expected agents that take part"):
+        copy.sample(3)
+    buffer.add({**dead, "active": np.ones((6, N_AGENTS), dtype=np.int8)}, dead, *rest)
+    assert len(buffer.sample(3).rewards) == 3
+
+
 def test_a_checkpoint_is_written_without_a_second_buffer_in_memory(tmp_path: Path) -> None:
     space = TeamSpaces(spaces.Box(0, 255, (3_000,), np.uint8), N_AGENTS).to_dict_space()
     buffer = TeamReplayBuffer(6_000, space, spaces.Discrete(4), n_envs=N_AGENTS * N_GAMES)
-    buffer._n_steps, buffer.pos, buffer.full = buffer.buffer_size, 0, True
+    buffer._n_steps, buffer.pos, buffer._has_played, buffer.full = buffer.buffer_size, 0, True, True
     assert buffer.nbytes > 30e6
     tracemalloc.start()
     try:

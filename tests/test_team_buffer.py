@@ -183,6 +183,8 @@ def test_what_cannot_be_buffered() -> None:
         make_buffer(env, n_envs=11)
     with pytest.raises(ValueError, match="expected the Dict observation space of CentralizedValueWrapper"):
         TeamRolloutBuffer(5, VECTOR, env.action_space)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="expected a full rollout of 5 steps, got 0; add the rest first"):
+        next(make_buffer(env).get())
 
 
 def test_observations_normalised_above_the_wrapper_are_refused() -> None:

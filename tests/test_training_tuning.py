@@ -207,4 +207,5 @@ def test_a_learning_rate_is_constant_or_decreases_to_zero() -> None:
     assert to_overrides({"learning_rate": 1e-3, "lr_schedule": "linear"}) == {"learning_rate": "lin_0.001"}
     assert to_overrides({"learning_rate": 1e-3, "lr_schedule": "constant"}) == {"learning_rate": 1e-3}
     assert to_overrides({"learning_rate": 1e-3}) == {"learning_rate": 1e-3}  # of an older study
-    assert to_overrides({"learning_rate": 1e-3, "env_wrapper": "os.system"}) == {"learning_rate": 1e-3}
+    with pytest.raises(ValueError, match="unknown parameter of a trial 'env_wrapper'"):
+        to_overrides({"learning_rate": 1e-3, "env_wrapper": "os.system"})

@@ -145,6 +145,8 @@ class TeamReplayBuffer(ReplayBuffer):
         self.aside = {key: array[:0, 0].copy() for key, array in self.seen.items()}
         self._free: list[int] = []
         self._n_steps = 0
+        #: Whether any agent took part since the last reset.
+        self._has_played = False
         available = psutil.virtual_memory().available
         if self.nbytes > available:
             warnings.warn(
@@ -158,6 +160,7 @@ class TeamReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         """Remove all steps."""
         super().reset()
+        self._has_played = False
         self._n_steps = 0
         self.aside_index[:] = _IN_NEXT_SLOT
         self._free = list(range(len(self.aside[OBS_KEY])))
@@ -197,6 +200,7 @@ class TeamReplayBuffer(ReplayBuffer):
         :raises ValueError: if the rows are not whole teams in index order
         """
         now, after = self._parts(obs), self._parts(next_obs)
+        self._has_played |= ACTIVE_KEY not in now or bool(now[ACTIVE_KEY].any())
         slot = self.pos
         self._begin(slot, now, None if episode_starts is None else np.asarray(episode_starts)[:: self.n_agents])
         ended = np.asarray(done).reshape(self.n_games, self.n_agents)[:, 0].astype(bool)
@@ -283,6 +287,8 @@ class TeamReplayBuffer(ReplayBuffer):
         self.aside = {key: np.array(part) for key, part in state["aside"].items()}
         self._free, self.pos, self._n_steps = list(state["free"]), state["pos"], state["n_steps"]
         self.full = self._n_steps == self.buffer_size
+        active = state["slots"].get(f"seen {ACTIVE_KEY}")
+        self._has_played = self._n_steps > 0 and (active is None or bool(active.any()))
 
     def _by_slot(self) -> dict[str, Array]:
         """Return all arrays with one entry per slot, by name."""
@@ -299,11 +305,13 @@ class TeamReplayBuffer(ReplayBuffer):
         :param batch_size: G, team steps
         :param env: unused: QPLEX does not train on VecNormalize
         """
+        self._check_filled()
         steps, games = self._draw(self.size(), batch_size)
         return self._get_samples(steps * self.n_games + games, env)
 
     def every_step(self) -> TeamReplaySamples:
         """Return all T E stored team steps, from the oldest on, those of all games at a step together."""
+        self._check_filled()
         return self._get_samples(np.arange(self.size() * self.n_games))
 
     def sample_sequences(self, n_sequences: int, length: int, burn_in: int) -> TeamReplaySamples:
@@ -317,6 +325,7 @@ class TeamReplayBuffer(ReplayBuffer):
         :param length: steps of each that enter the loss; fewer while the buffer holds fewer
         :param burn_in: steps before them
         """
+        self._check_filled()
         length = min(length, self.size())
         first, games = self._draw(self.size() - length + 1, n_sequences)
         window = np.arange(-burn_in, length)
@@ -338,6 +347,15 @@ class TeamReplayBuffer(ReplayBuffer):
             counted=self.to_torch(np.tile(window >= 0, n_sequences)),
         )
         return samples._replace(sequences=sequences)
+
+    def _check_filled(self) -> None:
+        if self.size() == 0:
+            raise ValueError("expected a replay buffer with at least one step, got an empty one; add steps first")
+        if not self._has_played:
+            raise ValueError(
+                f"expected agents that take part, got none in {self.size()} steps of {self.n_games} games; there is "
+                f"nothing to learn from: check the {ACTIVE_KEY!r} of the environment, or raise learning_starts"
+            )
 
     def _draw(self, n_steps: int, count: int) -> tuple[Indices, Indices]:
         """Draw ``count`` steps, counted from the oldest, and games, with the generator that SB3 seeds."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, ItemsView, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, get_args
 from weakref import WeakValueDictionary
 
@@ -128,8 +127,24 @@ _ROW_ARRAYS: Final = ("actions", "rewards", "returns", "episode_starts", "values
 Ends = Literal["own", "team"]
 
 
-#: Updates statistics with the returns of a rollout, once, and returns the conversion of values to them.
-Rescaling: TypeAlias = Callable[[ValueNormalizer], tuple[th.Tensor, th.Tensor]]
+@dataclass
+class RolloutReturns:
+    """
+    Returns of one rollout, for policies that normalise values.
+
+    :param returns: all returns used for training
+    :param known: the conversion of values, once it was asked for
+    """
+
+    returns: npt.NDArray[np.floating]
+    agents: npt.NDArray[np.integer]
+    known: tuple[th.Tensor, th.Tensor] | None = None
+
+    def rescaling(self, normalizer: ValueNormalizer) -> tuple[th.Tensor, th.Tensor]:
+        """Return the conversion of values to the new statistics, which the first call updates with the returns."""
+        if self.known is None:
+            self.known = normalizer.update(self.returns, self.agents)
+        return self.known
 
 
 class Sequences(NamedTuple):
@@ -168,16 +183,16 @@ class TeamMinibatch(dict[str, th.Tensor]):
     this package read :attr:`teams`.
 
     :param entries: all other entries of the rows' observations, ``"obs"`` among them
-    :param rescaling: that of the rows' rollout
+    :param returns: returns of the rows' rollout
     :param old_values: (B,) old values of the rows, a copy that may be modified
     """
 
     def __init__(
-        self, teams: WholeTeams, entries: dict[str, th.Tensor], rescaling: Rescaling, old_values: th.Tensor
+        self, teams: WholeTeams, entries: dict[str, th.Tensor], returns: RolloutReturns, old_values: th.Tensor
     ) -> None:
         super().__init__(entries)
         self.teams = teams
-        self._rescaling = rescaling
+        self._returns = returns
         self._old_values: th.Tensor | None = old_values
 
     def update_statistics(self, normalizer: ValueNormalizer) -> None:
@@ -185,7 +200,7 @@ class TeamMinibatch(dict[str, th.Tensor]):
         Update the statistics with the rollout's returns, and convert the minibatch's old values to them, so that they
         equal the values of the unchanged critic, as PPO's ``clip_range_vf`` expects. Call it once per minibatch.
         """
-        scale, shift = self._rescaling(normalizer)
+        scale, shift = self._returns.rescaling(normalizer)
         if self._old_values is not None:
             agents = self[AGENT_KEY].reshape(-1).long()
             scale, shift = (values[agents] if values.ndim else values for values in (scale, shift))
@@ -306,6 +321,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         self.n_games = check_whole_teams(n_envs, self.n_agents, "give the buffer the rows of whole games")
         self._agents = np.tile(np.arange(self.n_agents), self.n_games)
         self._allocated = False
+        self._returns = RolloutReturns(np.zeros(0), self._agents[:0])
         self._later: list[tuple[int, LaterValues]] = []
         self._waiting[id(observation_space)] = self
         #: (T / L, E, M), the memory of games before each sequence, of policies that have one: that of all agents,
@@ -458,8 +474,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
                 following, continues = self.values[step], 1.0 - self.episode_starts[step]
         super().compute_returns_and_advantage(last_values, dones)
         agents = np.broadcast_to(self._agents, counted.shape)
-        returns, of_agents = self.returns[counted], agents[counted]
-        self._rescaling: Rescaling = cache(lambda normalizer: normalizer.update(returns, of_agents))
+        self._returns = RolloutReturns(self.returns[counted], agents[counted])
         if self.normalize_advantage == "agent":
             by_team = (self.buffer_size, self.n_games, self.n_agents)
             rewards, playing = self.rewards.reshape(by_team), counted.reshape(by_team)
@@ -489,9 +504,10 @@ class TeamRolloutBuffer(DictRolloutBuffer):
         :param batch_size: rows per minibatch, rounded down to whole teams, at least one; None for all; inactive rows
             are omitted
         :return: minibatches of whole teams: rows of one team are consecutive and in index order
-        :raises ValueError: if no agent was ever active
+        :raises ValueError: if the buffer is not full, or no agent was ever active
         """
-        assert self.full
+        if not self.full:
+            raise ValueError(f"expected a full rollout of {self.buffer_size} steps, got {self.pos}; add the rest first")
         # Team steps with at least one active agent, each ``step * E + game``.
         playing = np.arange(self.buffer_size * self.n_games)
         if self.active is not None:
@@ -556,7 +572,7 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             sequences,
         )
         return DictRolloutBufferSamples(
-            observations=TeamMinibatch(teams, entries, self._rescaling, parts["values"]),
+            observations=TeamMinibatch(teams, entries, self._returns, parts["values"]),
             actions=parts["actions"].float(),
             old_values=parts["values"],
             old_log_prob=parts["log_probs"],

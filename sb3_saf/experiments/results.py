@@ -6,6 +6,7 @@ is finished, the configuration of all cells, and for each experiment what was re
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
 import time
@@ -169,8 +170,12 @@ class Results:
         if not run.folder.exists():
             return None
         try:
+            kinds = {"wall_seconds": float, "processor_seconds": float}
+            wrong = [name for name, kind in kinds.items() if not isinstance(run.finished().get(name), kind)]
+            damage = [f"{run.folder} has no {name}" for name in wrong]
             files = (RUN_FILE, MODEL, BEST_MODEL, CURVE, EVALUATIONS) if cell.is_trained else (RUN_FILE,)
-            damage = [text for name in files if (text := run.damage(name)) is not None]
+            damage += [text for name in files if (text := run.damage(name)) is not None]
+            assert damage or run.description
         except ValueError as error:
             damage = [str(error)]
         if damage:
@@ -187,7 +192,15 @@ class Results:
         if (damage := run.damage(name)) is not None:
             self.damaged[path] = damage
             return None
-        return self._read(path, LevelResult)
+        result = self._read(path, LevelResult)
+        if result is None:
+            return None
+        n_episodes = run.description["options"]["episodes"]
+        for returns in [play.returns for play in result.plays] or [[]]:
+            if len(returns) != n_episodes or not all(map(math.isfinite, returns)):
+                self.damaged[path] = f"{path} must have {n_episodes} finite returns, got {returns}"
+                return None
+        return result
 
     def missing_tests(self, cell: Cell) -> tuple[Level, ...]:
         """Return the levels at which a cell has not been tested; all of them if it is not trained."""

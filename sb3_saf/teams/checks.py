@@ -6,11 +6,13 @@ import importlib
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from numbers import Integral
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from stable_baselines3.common.callbacks import BaseCallback
+
+if TYPE_CHECKING:  # actors are played without Stable-Baselines3
+    from stable_baselines3.common.callbacks import BaseCallback
 
 #: Largest seed of a run: the limit of NumPy's global generator, which SB3 seeds.
 MAX_SEED: Final = 2**32 - 1
@@ -113,7 +115,7 @@ class SettingsError(ValueError):
 def check_hears_rollouts(callback: BaseCallback) -> None:
     """Check that a callback is not within another one, which passes on steps only; otherwise raise SettingsError."""
     if callback.parent is not None:
-        within = type(callback.parent).__name__
+        within, callback.parent = type(callback.parent).__name__, None  # so that it may be given to learn then
         raise SettingsError(
             f"{type(callback).__name__} must hear of rollouts, which {within} does not pass on: give it to learn "
             "itself, alone or in a list"

@@ -62,10 +62,14 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         models = list(dict.fromkeys(options.model))
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
         settings = [_settings_of(path, options) for path in paths]
-        levels = [{"env": own.env_id, **own.env_kwargs} for own in settings]
+        suite = settings[0].environment.suite
+        shaping = () if suite is None else suite.training_params  # games of evaluations do not have them
+        levels = [
+            {"env": own.env_id, **{name: value for name, value in own.env_kwargs.items() if name not in shaping}}
+            for own in settings
+        ]
         if changed := next(filter(None, (differences(levels[0], level) for level in levels)), ""):
             raise ValueError(f"models side by side play one game, but {changed}; choose a level with --env-kwargs")
-        suite = settings[0].environment.suite
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
         with closing(
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)

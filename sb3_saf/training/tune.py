@@ -17,7 +17,7 @@ from optuna.trial import TrialState
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_saf.policies.parts import AlgorithmSpec
-from sb3_saf.teams.checks import MAX_SEED
+from sb3_saf.teams.checks import MAX_SEED, unknown_name
 from sb3_saf.teams.files import differences
 from sb3_saf.training.run import RunOptions, SeededEvalCallback, Training
 from sb3_saf.training.settings import Settings, algorithm_arguments
@@ -95,8 +95,11 @@ def sample_overrides(
 
 def to_overrides(params: Mapping[str, Any]) -> dict[str, Any]:
     """Convert the parameters of a trial to overrides for ``load_settings``."""
+    searched = {*_SEARCH, *_POLICY_SEARCH, _LR_SCHEDULE}
+    for name in params.keys() - searched:  # of a study of others
+        raise unknown_name("parameter of a trial", name, searched)
     of_policy = {name: value for name, value in params.items() if name in _POLICY_SEARCH}
-    others = {name: value for name, value in params.items() if name in {*_SEARCH, _LR_SCHEDULE}}
+    others = {name: value for name, value in params.items() if name not in _POLICY_SEARCH}
     if others.pop(_LR_SCHEDULE, None) == _LINEAR:
         others["learning_rate"] = f"lin_{others['learning_rate']}"
     return {**others, "policy_kwargs": of_policy} if of_policy else others
