@@ -556,6 +556,7 @@ def main() -> None:
     for page, text in pages().items():
         write_text(page, text)
     frames, band = grid(), 100 * MARGIN
+    write_text(RAW / "marl_eval.json", json.dumps(marl_eval(frames, "hecogrid")))
     figure = draw_differences(
         forest(frames.tests), panel="panel", x_label="SAF minus other, % of the treasures", names=WORDS, band=band
     )

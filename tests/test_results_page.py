@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pandas as pd
 
 from benchmarks import paper, suite_results
-from sb3_saf.experiments.tables import CURVES, RUNS
+from sb3_saf.experiments.tables import CURVES, RUNS, marl_eval
 
 
 def test_pages_of_results_equal_their_raw_data() -> None:
@@ -16,6 +17,10 @@ def test_pages_of_results_equal_their_raw_data() -> None:
     for page, text in pages.items():
         assert page.read_text(encoding="utf-8") == text, f"{page}: run python -m benchmarks.paper"
     assert pages[paper.PAGES[0]].count("\n") <= 150
+    grid = json.loads((paper.RAW / "marl_eval.json").read_text(encoding="utf-8"))
+    assert grid == marl_eval(paper.grid(), "hecogrid")
+    runs = [sorted(of_method) for of_task in grid["hecogrid"].values() for of_method in of_task.values()]
+    assert runs == [[f"seed_{seed}" for seed in range(5)]] * 24 * 4
 
 
 def test_tables_of_predictions_can_be_read() -> None:
