@@ -26,6 +26,7 @@ from sb3_saf import (
     evaluate_team,
     make_team_env,
 )
+from sb3_saf.buffers.replay import TeamReplayBuffer
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.critic import ValueNormalizer
@@ -350,15 +351,21 @@ def test_minibatches_without_anybody_are_skipped() -> None:
 
 
 @pytest.mark.parametrize("key", ["active", "state"])
-def test_rows_of_a_game_that_disagree_are_refused(key: str) -> None:
+@pytest.mark.parametrize("kind", ["rollout", "replay"])
+def test_rows_of_a_game_that_disagree_are_refused(key: str, kind: str) -> None:
     env = telling_env()
-    buffer = make_buffer(env, 5)
     obs: Any = env.reset()
     zeros = np.zeros(6, np.float32)
-    buffer.add(obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
+    if kind == "rollout":
+        buffer: Any = make_buffer(env, 5)
+        step = (obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
+    else:
+        buffer = TeamReplayBuffer(9, env.observation_space, env.action_space, n_envs=6)
+        step = (obs, obs, zeros, zeros, zeros, [{}] * 6)
+    buffer.add(*step)
     obs[key][4, 0] += 1
     with pytest.raises(ValueError, match=f"expected one '{key}' for all rows of a game, but the rows of game 1 differ"):
-        buffer.add(obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
+        buffer.add(*step)
 
 
 # --- policies ---------------------------------------------------------------------------------------------------------

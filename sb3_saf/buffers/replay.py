@@ -18,7 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_saf.buffers.rollout import check_rows
+from sb3_saf.buffers.rollout import check_rows, of_games
 from sb3_saf.teams.checks import check_count, check_form, check_whole_teams
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, TRUNCATED, Array, TeamSpaces
 
@@ -231,7 +231,7 @@ class TeamReplayBuffer(ReplayBuffer):
             parts[ACTION_MASK_KEY] = np.asarray(obs[ACTION_MASK_KEY]).reshape(*by_agent, -1)
         for key in (ACTIVE_KEY, STATE_KEY):
             if key in self.seen:
-                parts[key] = np.asarray(obs[key])[:: self.n_agents]
+                parts[key] = of_games(obs, key, self.seen[key], self.n_agents, self.pos)
         return parts
 
     def _begin(self, slot: int, now: dict[str, Array], starts: npt.NDArray[Any] | None) -> None:

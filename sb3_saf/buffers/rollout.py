@@ -246,6 +246,16 @@ def check_rows(obs: Mapping[str, Array], team: TeamSpaces, agents: Array) -> Arr
     return own
 
 
+def of_games(obs: Mapping[str, Array], key: str, stored: Array, n_agents: int, slot: int) -> Array:
+    """Return an entry that all rows of a game share, (B, ...) -> (E, ...), of an array (S, E, ...)."""
+    by_game = np.asarray(obs[key]).reshape(stored.shape[1], n_agents, *stored.shape[2:])
+    differs = by_game[:, 0] != by_game[:, slot % n_agents]
+    if differs.any():
+        game = int(np.flatnonzero(differs.reshape(len(by_game), -1).any(axis=1))[0])
+        raise ValueError(f"expected one {key!r} for all rows of a game, but the rows of game {game} differ")
+    return by_game[:, 0]
+
+
 class TeamRolloutBuffer(DictRolloutBuffer):
     """
     SB3 rollout buffer for the observations of ``CentralizedValueWrapper``, passed as ``rollout_buffer_class``.
@@ -400,22 +410,13 @@ class TeamRolloutBuffer(DictRolloutBuffer):
             )
         for array, key in ((self.active, ACTIVE_KEY), (self.states, STATE_KEY)):
             if array is not None:
-                array[self.pos] = self._of_games(obs, key, array)
+                array[self.pos] = of_games(obs, key, array, self.n_agents, self.pos)
         if self.starts is not None:
             self.starts[self.pos] = np.reshape(obs[EPISODE_START_KEY], (-1, 1))
         if isinstance(value, LaterValues):
             self._later.append((self.pos, value))
             value = th.full_like(log_prob, th.nan)  # until compute_returns_and_advantage
         super().add(obs, action, reward, episode_start, value, log_prob)
-
-    def _of_games(self, obs: dict[str, Array], key: str, stored: Array) -> Array:
-        """Return an entry that all rows of a game share, once per game: (B, ...) -> (E, ...)."""
-        by_game = np.asarray(obs[key]).reshape(self.n_games, self.n_agents, *stored.shape[2:])
-        differs = by_game[:, 0] != by_game[:, self.pos % self.n_agents]
-        if differs.any():
-            game = int(np.flatnonzero(differs.reshape(self.n_games, -1).any(axis=1))[0])
-            raise ValueError(f"expected one {key!r} for all rows of a game, but the rows of game {game} differ")
-        return by_game[:, 0]
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: npt.NDArray[Any]) -> None:
         """
