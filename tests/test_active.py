@@ -358,7 +358,7 @@ def test_rows_of_a_game_that_disagree_are_refused(key: str, kind: str) -> None:
     zeros = np.zeros(6, np.float32)
     if kind == "rollout":
         buffer: Any = make_buffer(env, 5)
-        step = (obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
+        step: Any = (obs, zeros, zeros, zeros, th.zeros(6), th.zeros(6))
     else:
         buffer = TeamReplayBuffer(9, env.observation_space, env.action_space, n_envs=6)
         step = (obs, obs, zeros, zeros, zeros, [{}] * 6)

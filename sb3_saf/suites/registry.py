@@ -206,6 +206,11 @@ class TeamEnvironment:
         params = {**self.suite.defaults, **params}
         return params if self.suite.complete is None else self.suite.complete(self.task, params)
 
+    def of_evaluation(self, params: Mapping[str, Any]) -> dict[str, Any]:
+        """Return parameters of the games without those of training only."""
+        of_training = () if self.suite is None else self.suite.training_params
+        return {name: value for name, value in params.items() if name not in of_training}
+
     def count_agents(self, params: Mapping[str, Any]) -> int:
         """Count the agents, N; a game is made unless the suite knows them."""
         if self.suite is not None and self.suite.complete is not None:
@@ -378,13 +383,8 @@ def references(env: str | TeamEnvironment, params: Mapping[str, Any] | None = No
     if params is None:
         return known
     environment = find_environment(env) if isinstance(env, str) else env
-    shaping = () if environment.suite is None else environment.suite.training_params
-    played = _without(environment.complete(params), shaping)
-    return [one for one in known if _without(environment.complete(one.params), shaping) == played]
-
-
-def _without(params: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: value for name, value in params.items() if name not in names}
+    played = environment.of_evaluation(environment.complete(params))
+    return [one for one in known if environment.of_evaluation(environment.complete(one.params)) == played]
 
 
 class Standing(NamedTuple):

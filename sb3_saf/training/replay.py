@@ -63,11 +63,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
         settings = [_settings_of(path, options) for path in paths]
         suite = settings[0].environment.suite
-        shaping = () if suite is None else suite.training_params  # games of evaluations do not have them
-        levels = [
-            {"env": own.env_id, **{name: value for name, value in own.env_kwargs.items() if name not in shaping}}
-            for own in settings
-        ]
+        levels = [{"env": own.env_id, **own.environment.of_evaluation(own.env_kwargs)} for own in settings]
         if changed := next(filter(None, (differences(levels[0], level) for level in levels)), ""):
             raise ValueError(f"models side by side play one game, but {changed}; choose a level with --env-kwargs")
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"

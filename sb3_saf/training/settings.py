@@ -167,9 +167,8 @@ class Settings:
         source: Any = self.env_id
         backend: Any = None
         params = dict(self.env_kwargs) if render_mode is None else {**self.env_kwargs, "render_mode": render_mode}
-        suite = self.environment.suite
-        if evaluation and suite is not None:
-            params = {key: value for key, value in params.items() if key not in suite.training_params}
+        if evaluation:
+            params = self.environment.of_evaluation(params)
         if {"env_wrapper", "frame_stack"} & self.wrapping.keys():  # of single games, not of compiled ones
             source, backend = replace(self.environment, make=self._make_game), "supersuit"
         env = make_team_env(
