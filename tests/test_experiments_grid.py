@@ -68,6 +68,14 @@ def test_number_of_cells(name: str, n_trained: int, n_random: int) -> None:
     assert len({cell.id for cell in cells}) == len(cells)
 
 
+def test_a_random_team_that_is_asked_for_is_tested_once() -> None:
+    """In unseen levels it would be there for the training level too, with seeds counted twice."""
+    asked = [Selection((0, 1), methods, ("TeamSupport-v0",)) for methods in (("saf", "random"), ("saf",), ("random",))]
+    both, without, alone = (grid_of("ood-coordination", selection=one) for one in asked)
+    assert both == without
+    assert alone == [cell for cell in without if not cell.is_trained]
+
+
 def test_levels_of_the_paper() -> None:
     levels = {name: list(EXPERIMENTS[name].tests()) for name in SIZES}
     assert levels["coordination"] == [at(1, 1), at(2, 1), at(3, 1)]

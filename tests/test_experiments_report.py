@@ -157,6 +157,11 @@ def test_results_that_are_not_there(tmp_path: Path) -> None:
         read_results(tmp_path, "joint")
     with pytest.raises(ValueError, match="unknown experiment 'jont'"):
         read_results(tmp_path, "jont")
+    for folder in ("mine", "other"):
+        (tmp_path / folder / folder).mkdir(parents=True)
+    (tmp_path / "mine" / "mine" / "experiment.json").touch()  # an experiment of another folder
+    with pytest.raises(ValueError, match="unknown experiment 'mine'; there is coordination"):
+        read_results(tmp_path / "other", "mine")
     for name in ("runs.csv", "curves.csv"):
         (tmp_path / name).write_text("method,task,train_level,level,seed,return_mean,score\nsaf,a,b,b,0,1.0,1.0\n")
     with pytest.raises(ValueError, match="n_agents, max_return, game_steps is missing"):

@@ -429,6 +429,20 @@ def test_an_unknown_name_lists_the_nearest(name: str, nearest: str) -> None:
         make_team_env(name)
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("nowhere.game", "cannot import 'nowhere.game' .* set PYTHONPATH"),
+        ("tests.toy_envs:CounterEnw", "expected a function or class, got tests.toy_envs.CounterEnw = None$"),
+        ("tests.test_other_games:Nim", "got a function that returned the AECEnv .*; convert it with"),
+        ("tests.toy_envs", "parallel_env = None; where agents take turns, name a function .*TurnsInParallel"),
+    ],
+)
+def test_a_game_that_cannot_be_made_says_why(name: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make_team_env(name)
+
+
 def test_a_result_stands_beside_what_is_known_of_its_task() -> None:
     spread = find_environment("mpe/simple_spread_v3")
     assert {one.task for one in references(spread)} == {"mpe/simple_spread_v3"}

@@ -457,8 +457,10 @@ def expand(experiment: Experiment, selection: Selection, config: RunConfig) -> l
         for env in envs
         for level, tests in levels.items()
         for method in methods
+        if method != RANDOM
     ]
-    random = [Cell(RANDOM, cell.env, level, cell.seed, (level,)) for cell in trained for level in cell.tests]
+    tested = dict.fromkeys(level for tests in levels.values() for level in tests)
+    random = [Cell(RANDOM, env, level, seed, (level,)) for seed in selection.seeds for env in envs for level in tested]
     return merge([*trained, *random])
 
 

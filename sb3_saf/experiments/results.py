@@ -283,7 +283,7 @@ class Results:
         if stored is not None:
             return own_experiment(name, stored.envs, stored.vary)
         own = [path.parent.name for folder in ("", "../*/") for path in self.folder.glob(f"{folder}*/experiment.json")]
-        raise unknown_name("experiment", name, [*own, *EXPERIMENTS])
+        raise unknown_name("experiment", name, [one for one in (*own, *EXPERIMENTS) if one != name])
 
 
 def _own(experiment: Experiment) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from packaging.requirements import Requirement
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf.suites
+from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.gymnasium_team import as_parallel
 from sb3_saf.teams.checks import import_by_name
 
@@ -253,8 +254,7 @@ class TeamEnvironment:
             if "render_mode" in kwargs:
                 hint = "; to show its games, give it the argument render_mode (PettingZoo's), or use --no-render"
             raise ValueError(f"{self.id} cannot be made with {kwargs}: {error}{hint}") from error
-        if not isinstance(game, pettingzoo.ParallelEnv):
-            raise ValueError(f"expected {self.id} to make a PettingZoo ParallelEnv, got a {type(game).__name__}")
+        check_is_parallel(game, is_factory=True)
         return game
 
     def warn_if_competitive(self) -> None:
@@ -290,7 +290,9 @@ def find_environment(name: str) -> TeamEnvironment:
         is_module = name.isidentifier() and find_spec(name) is not None
     if ":" in name or "." in name or is_module:
         module, _, function = name.partition(":")
-        return TeamEnvironment(name, import_by_name(module, function or "parallel_env", f"environment {name!r}"))
+        turns = "" if function else "; where agents take turns, name a function that returns sb3_saf.TurnsInParallel"
+        make = import_by_name(module, function or "parallel_env", f"environment {name!r}", turns)
+        return TeamEnvironment(name, make)
     home, *others = sorted(suites().values(), key=lambda one: one.name != HOME)
     short = [task.removesuffix("-v0") for task in home.tasks]
     ids = [*short, *(f"{one.name}/{task}" for one in others for task in one.examples)]

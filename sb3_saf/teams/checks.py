@@ -78,17 +78,18 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
     return n_rows // n_agents
 
 
-def import_by_name(module: str, name: str, what: str) -> Any:
-    """Import a callable from a module; the ValueError contains ``what``."""
+def import_by_name(module: str, name: str, what: str, hint: str = "") -> Any:
+    """Import a callable from a module; the ValueError contains ``what``, and ``hint`` if the module lacks it."""
     try:
-        value = getattr(importlib.import_module(module), name)
+        found = importlib.import_module(module)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{what}: cannot import {name} from {module!r} ({error}); install the package, or set PYTHONPATH to "
-            "the folder that has it"
+            f"{what}: cannot import {module!r} ({error}); install the package, or set PYTHONPATH to the folder that "
+            "has it"
         ) from error
+    value = getattr(found, name, None)
     if not callable(value):
-        raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}")
+        raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}{hint}")
     return value
 
 

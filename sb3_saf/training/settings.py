@@ -363,7 +363,7 @@ def _build(
         )
     wrapping = {key: own[key] for key in WRAPPER_KEYS if key in own}
     if wrapping.get("normalize", False) is not False and issubclass(spec.algorithm, OffPolicyAlgorithm):
-        raise ValueError(f"normalize is for algorithms that learn from fresh rollouts, got it with {algo}")
+        raise ValueError(f"normalize is for PPO, A2C and TRPO, got it with {algo}")
     n_envs, game_steps = own.get("n_envs", 1), convert("game_steps", own.get("game_steps"), int)
     for stage in stages_of(wrapping, game_steps):
         environment.complete({**env_kwargs, **stage.params})
