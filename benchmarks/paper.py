@@ -456,7 +456,7 @@ def forest(tests: pd.DataFrame) -> pd.DataFrame:
     """Return SAF minus MAPPO and minus the paper's IPPO in each setting, and pooled in each group."""
     rows = []
     for group, of_group in tests.groupby("group", sort=False):
-        panel = "coordination" if group == "coordination" else "heterogeneity"
+        panel = "coordination" if group == "coordination" else "heterogeneity, joint"
         settings = of_group.groupby(["task", "coordination", "heterogeneity"], sort=False)
         named = [(f"{task}, c = {c}, h = {h}", here) for (task, c, h), here in settings]
         for label, here in [*named, (f"{group}, together", of_group)]:
