@@ -81,13 +81,12 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
 def import_by_name(module: str, name: str, what: str, hint: str = "") -> Any:
     """Import a callable from a module; the ValueError contains ``what``, and ``hint`` if the module lacks it."""
     try:
-        found = importlib.import_module(module)
+        value = getattr(importlib.import_module(module), name, None)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{what}: cannot import {module!r} ({error}); install the package, or set PYTHONPATH to the folder that "
             "has it"
         ) from error
-    value = getattr(found, name, None)
     if not callable(value):
         raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}{hint}")
     return value
