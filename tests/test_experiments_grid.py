@@ -241,7 +241,7 @@ def test_plan_counts_what_is_finished(capsys: pytest.CaptureFixture[str], tmp_pa
 BAD = {
     ("run", "coordinaton"): "unknown experiment 'coordinaton' (did you mean 'coordination'?)",
     ("run",): "name an experiment: ",
-    ("run", "--env", "TeamSupport-v0", "a.b"): "several environments need a name before --env",
+    ("run", "--env", "TeamSupport-v0", "a.b"): "experiments run mine --env TeamSupport-v0 a.b",
     ("run", "joint", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",
     ("run", "..", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",
     ("run", "cells", "--env", "TeamSupport-v0"): "an experiment of your own needs a name",

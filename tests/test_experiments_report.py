@@ -27,6 +27,7 @@ from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.folders import finish_run
 from sb3_saf.training.statistics import learning_curve, mean_over_seeds
 from tests.experiments_jobs import InlineEngine, read_table
+from tests.test_training_commands import failed
 
 pytest.importorskip("rliable")
 TASKS = ("TeamTogether", "TeamSupport")
@@ -155,13 +156,13 @@ def test_evaluations_have_times_of_their_own() -> None:
 def test_results_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="has no results of 'joint': expected a folder of cells, or runs"):
         read_results(tmp_path, "joint")
-    with pytest.raises(ValueError, match="unknown experiment 'jont'"):
-        read_results(tmp_path, "jont")
+    with pytest.raises(ValueError, match="has no results of 'my grid': expected a folder of cells, or runs"):
+        read_results(tmp_path, "my grid")
     for folder in ("mine", "other"):
         (tmp_path / folder / folder).mkdir(parents=True)
     (tmp_path / "mine" / "mine" / "experiment.json").touch()  # an experiment of another folder
     with pytest.raises(ValueError, match="unknown experiment 'mine'; there is coordination"):
-        read_results(tmp_path / "other", "mine")
+        Results(tmp_path / "other").experiment("mine")
     for name in ("runs.csv", "curves.csv"):
         (tmp_path / name).write_text("method,task,train_level,level,seed,return_mean,score\nsaf,a,b,b,0,1.0,1.0\n")
     with pytest.raises(ValueError, match="n_agents, max_return, game_steps is missing"):
@@ -378,6 +379,10 @@ def test_an_environment_of_ones_own(
     assert "| tests.toy_envs:CounterEnv | max_cycles=3 | max_cycles=5 | seeds |" in page
     table = pd.read_csv(folder / name / "runs.csv")
     assert table["score"].between(0, 1).all() and table["max_return"].isna().all()
+    assert cli.main(["report", env, "--beside", str(folder)]) == 0
+    assert f"nowhere has no results of '{name}': expected" in failed(
+        ["report", env, "--beside", "nowhere"], capsys, cli.main
+    )
     # The printed command runs as printed, and finds everything finished.
     (again,) = (line for line in page.splitlines() if line.startswith("python -m sb3_saf.experiments run"))
     assert cli.main([*shlex.split(again)[3:], "--workers", "1"]) == 0

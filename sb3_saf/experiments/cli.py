@@ -165,9 +165,10 @@ def _add_machine(parser: argparse.ArgumentParser) -> None:
 def _subject(options: argparse.Namespace) -> tuple[Experiment, Results, Selection]:
     """Return the experiment, the folder of its results, and the selected part; ValueError for unknown names."""
     if options.name is None and len(options.env) != 1:
-        example = f"{python_command(MODULE)} {options.command} coordination, or --env mpe2.simple_spread_v3"
-        what = "several environments need a name before --env" if options.env else "name an experiment"
-        raise ValueError(f"{what}: {example}")
+        what, example = "name an experiment", "coordination, or --env mpe2.simple_spread_v3"
+        if options.env:
+            what, example = "several environments need a name before --env", f"mine --env {' '.join(options.env)}"
+        raise ValueError(f"{what}: {python_command(MODULE)} {options.command} {example}")
     # An environment names the grid on it.
     name = folder_name(options.env[0] if options.name is None else options.name).removesuffix("-v0")
     results = Results(options.folder or Path("runs", "experiments", _size(options) if name in EXPERIMENTS else name))

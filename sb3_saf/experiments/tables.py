@@ -103,10 +103,8 @@ def read_results(folder: str | Path, name: str) -> Frames:
             except ValueError as error:
                 raise ValueError(f"{published} has no {RUNS} and {CURVES} of experiments: {error}") from None
             return Frames(tests, curves)
-    experiment = results.experiment(name)
-    if results.config() is None:
         raise ValueError(f"{folder} has no results of {name!r}: expected a folder of cells, or {RUNS} and {CURVES}")
-    cells = requested(experiment, results)
+    cells = requested(results.experiment(name), results)
     tests = frame_of_tests(results, cells)
     if tests.empty:
         raise ValueError(
@@ -126,7 +124,7 @@ def beside(ours: Frames, theirs: Frames) -> Frames:
     """
     here, games = ours.tests, ["task", "level", "n_agents", "max_return"]
     games += ["game"] if "game" in theirs.tests else []  # older ones do not tell
-    rows, known = (tests.fillna({"max_return": -1}) for tests in (theirs.tests, here))
+    rows, known = (one.assign(max_return=one["max_return"].astype(float).fillna(-1)) for one in (theirs.tests, here))
     same_games = keys_of(rows, *games).isin(keys_of(known, *games))
     rows = theirs.tests[same_games & rows["game_steps"].isin({0, *here["game_steps"]})]
     if rows.empty:
