@@ -247,7 +247,7 @@ def check_rows(obs: Mapping[str, Array], team: TeamSpaces, agents: Array) -> Arr
 
 
 def of_games(obs: Mapping[str, Array], key: str, stored: Array, n_agents: int, slot: int) -> Array:
-    """Return an entry that all rows of a game share, (B, ...) -> (E, ...), of an array (S, E, ...)."""
+    """Return an entry that all rows of a game share, (B, ...) -> (E, ...); ValueError if the compared row differs."""
     by_game = np.asarray(obs[key]).reshape(stored.shape[1], n_agents, *stored.shape[2:])
     differs = by_game[:, 0] != by_game[:, slot % n_agents]
     if differs.any():
