@@ -2,10 +2,10 @@
 Measure what teams learn on the suites' tasks at the budgets that others publish: ``results/suites.md``.
 
 ``python -m benchmarks.suite_results`` trains what is missing (``sb3_saf.experiments run``, one folder for each task),
-adds the finished cells to the raw data in ``results/field``, and writes the table of that page from it; after an
-interruption, the same command continues. All tasks get their first seed before any gets its second. Suites that do not
-install together are trained in turn (``--tasks``), each in its own environment. Results of other programs, from
-``python -m benchmarks.peers``, are in ``results/suites_baselines.csv``; published ones in
+adds the finished cells to the raw data in ``results/field``, and writes the table and the figure of that page from it;
+after an interruption, the same command continues. All tasks get their first seed before any gets its second. Suites
+that do not install together are trained in turn (``--tasks``), each in its own environment. Results of other programs,
+from ``python -m benchmarks.peers``, are in ``results/suites_baselines.csv``; published ones in
 ``sb3_saf/suites/references.csv``.
 """
 
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from benchmarks.paper import add, fill
 from benchmarks.peers import FILE as BASELINES
@@ -25,6 +26,7 @@ from sb3_saf.experiments.cli import main as experiments
 from sb3_saf.experiments.definitions import METHODS as NAMED
 from sb3_saf.experiments.tables import read_results
 from sb3_saf.suites.registry import RANDOM, references
+from sb3_saf.training.figures import draw_curves
 from sb3_saf.training.statistics import FEWEST_SEEDS, mean_over_seeds
 
 METHODS: Final = ("saf", "mappo", "ippo")
@@ -32,7 +34,8 @@ SEEDS: Final = (0, 1, 2)
 PAGE: Final = Path("results", "suites.md")
 RAW: Final = Path("results", "field")
 
-
+#: Game steps of trainings whose curves are drawn.
+_LONG: Final = 1_000_000
 #: Shapes the rewards of training only.
 _SHAPING: Final = "reward_shaping_steps:"
 
@@ -101,17 +104,26 @@ def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     experiments([*words, "--env-kwargs", *task.params] if task.params else words)
 
 
-def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str]]:
-    """Yield results of others' trainings, at least half and at most twice as long, and notes with method and source."""
+def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str, float | None]]:
+    """
+    Yield results of others' trainings, at least half and at most twice as long, notes with method and source, and the
+    returns, None for a result of another unit.
+    """
     for one in references(task.env_id):
         game = " ".join([one.task, *(f"{name}:{value}" for name, value in one.params.items())])
         is_elsewhere = not one.is_own and BASELINES.name not in one.source
         if is_elsewhere and game == task.game and task.game_steps / 2 <= one.game_steps <= 2 * task.game_steps:
-            yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}"
+            score = one.value if one.unit == "return" else None
+            yield one.result, f"{one.method} after {one.game_steps:,} game steps: {one.source}", score
     is_near = baselines["game_steps"].between(task.game_steps / 2, 2 * task.game_steps)
     here = baselines[(baselines["task"] == task.game) & is_near]
     for (program, game_steps), trainings in here.groupby(["program", "game_steps"]):
-        yield _over_seeds(trainings["return"]), f"{program} after {game_steps:,} game steps: `{BASELINES.name}`"
+        note = f"{program} after {game_steps:,} game steps: `{BASELINES.name}`"
+        yield _over_seeds(trainings["return"]), note, float(trainings["return"].mean())
+
+
+def _in_short(method: str) -> str:
+    return NAMED[method].words.partition(",")[0]
 
 
 def _over_seeds(values: pd.Series) -> str:
@@ -132,7 +144,7 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
     missing = []
     for task in tasks:
         others = []
-        for result, note in beside(task, baselines):
+        for result, note, _ in beside(task, baselines):
             notes += [] if note in notes else [note]
             others.append(f"{result} ({notes.index(note) + 1})")
         if not (folder / task.name).is_dir():
@@ -146,7 +158,7 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
             if here.empty:
                 continue
             won = "" if here["success_rate"].isna().any() else f", {here['success_rate'].mean():.0%} won"
-            cells = [f"`{task.game}`", f"{here['game_steps'].max():,}", NAMED[method].words.partition(",")[0]]
+            cells = [f"`{task.game}`", f"{here['game_steps'].max():,}", _in_short(method)]
             cells += [
                 f"**{_over_seeds(here['return_mean'])}**{won}",
                 "; ".join(others),
@@ -161,8 +173,26 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
     yield f"{untrained}Commits: {', '.join(sorted(commits))}."
 
 
+def figure(tasks: Iterable[Task], folder: Path) -> Figure:
+    """Draw learning curves of long trainings where there are several methods, beside a random team and others."""
+    baselines, runs = pd.read_csv(BASELINES), {}
+    lines: dict[str, dict[str, float]] = {"random team": {}, "others, best": {}, "others, lowest": {}}
+    for task in tasks:
+        if task.game_steps < _LONG or not (folder / task.name).is_dir():
+            continue
+        frames = read_results(folder, task.name)
+        if frames.curves["method"].nunique() > 1:
+            runs[task.game] = frames.curves.assign(task=task.game)
+            random = frames.tests[frames.tests["method"] == RANDOM]
+            lines["random team"][task.game] = random["return_mean"].mean()
+            if scores := [score for _, _, score in beside(task, baselines) if score is not None]:
+                lines["others, best"][task.game], lines["others, lowest"][task.game] = max(scores), min(scores)
+    names = {name: _in_short(name) for name in NAMED}
+    return draw_curves(pd.concat(runs.values()), None, "task", "return", names, lines)
+
+
 def main() -> None:
-    """Run what is missing, and write raw data and table."""
+    """Run what is missing, and write raw data, table and figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-f", "--folder", type=Path, default=Path("runs", "suites"), help="of the trainings")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
@@ -178,6 +208,7 @@ def main() -> None:
             add(task.name, options.folder / task.name / task.name, RAW)
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(fill(text, {"table": "\n".join(table(TASKS, RAW))}), encoding="utf-8")
+    figure(TASKS, RAW).savefig(RAW / "curves.png", dpi=80)
 
 
 if __name__ == "__main__":

@@ -67,5 +67,5 @@ def test_trainings_of_others_stand_beside_those_of_similar_length() -> None:
     task = suite_results.Task("jaxmarl/MPE_simple_spread_v3", 1_000_000)
     lengths = (400_000, 500_000, 2_000_000, 2_100_000)
     rows = [{"task": task.game, "program": "P", "game_steps": steps, "return": -1.0} for steps in lengths]
-    notes = [note for _, note in suite_results.beside(task, pd.DataFrame(rows)) if note.startswith("P")]
+    notes = [note for _, note, _ in suite_results.beside(task, pd.DataFrame(rows)) if note.startswith("P")]
     assert [note.split()[2] for note in notes] == ["500,000", "2,000,000"]

@@ -69,8 +69,13 @@ def test_curves_are_drawn_where_they_are() -> None:
     assert (axes.get_xlabel(), axes.get_title()) == ("game steps", "t")
     assert figure.get_suptitle() == "T"
     assert [len(draw_curves(runs(saf=[[1, 2, 3]] * n)).axes[0].collections) for n in (2, 3)] == [0, 1], "bands"
-    two = draw_curves(pd.concat([table, runs(saf=[[0, 0, 1]]).assign(task="u")]), panel="task")
-    assert [text.get_text() for text in two.legends[0].get_texts()] == ["saf (1 to 2 seeds)", "mappo (1 seed)"]
+    tables = pd.concat([table, runs(saf=[[0, 0, 1]]).assign(task="u")])
+    references: dict[str, float | dict[str, float]] = {"all": 7.0, "one": {"u": 9.0}}
+    two = draw_curves(tables, panel="task", references=references)
+    labels = ["saf (1 to 2 seeds)", "mappo (1 seed)", "all", "one"]
+    assert [text.get_text() for text in two.legends[0].get_texts()] == labels
+    heights = [[float(np.max(line.get_ydata())) for line in axes.get_lines()] for axes in two.axes]
+    assert heights == [[5.5, 1.0, 7.0], [1.0, 7.0, 9.0]], "a reference of one panel stands in that panel"
 
 
 def test_levels_are_numbers_in_order_or_words_as_they_come() -> None:

@@ -43,6 +43,7 @@ _COLOURS: Final = {
     "qplex-pool": "#8B6F00",
     "qmix": "#882255",
     "vdn": "#332288",
+    "pqn": "#661100",
     "random": "#666666",
 }
 #: Line, hatch and mark of variants of a method, which share its colour: with memory, with weights for each agent.
@@ -139,7 +140,7 @@ def draw_curves(
     panel: str | None = None,
     y_label: str = TEAM_RETURN,
     names: Mapping[str, str] | None = None,
-    references: Mapping[str, float] | None = None,
+    references: Mapping[str, float | Mapping[str, float]] | None = None,
 ) -> Figure:
     """
     Draw learning curves: mean and, from three seeds on, 95 % interval (Student's t) over seeds.
@@ -147,7 +148,7 @@ def draw_curves(
     :param runs: columns ``method``, ``seed``, ``game_steps``, ``score``
     :param panel: column with one panel per value, for instance ``"task"``
     :param names: names of methods in words
-    :param references: names and scores of horizontal lines, for instance of a random team
+    :param references: names and scores of horizontal lines, for instance of a random team, or their scores by panel
     """
     require_columns(runs, CURVE_COLUMNS)
     panels, methods = _panels(runs, panel), _methods_of(runs)
@@ -167,8 +168,10 @@ def draw_curves(
             ax.plot(steps, curve["value"], color=style.colour, linestyle=style.line, label=label, marker=marker)
             if of_method["seed"].nunique() >= FEWEST_SEEDS:
                 ax.fill_between(steps, curve["low"], curve["high"], color=style.colour, alpha=0.2, linewidth=0)
-        for (label, score), line in zip((references or {}).items(), cycle(_REFERENCE_LINES), strict=False):
-            ax.axhline(score, color=_REFERENCE, linestyle=line, label=label)
+        for (label, scores), line in zip((references or {}).items(), cycle(_REFERENCE_LINES), strict=False):
+            score = scores.get(name) if isinstance(scores, Mapping) else scores
+            if score is not None:
+                ax.axhline(score, color=_REFERENCE, linestyle=line, label=label)
         ax.set(xlabel="game steps", ylabel=y_label, title=fill(name, _TITLE_WIDTH))
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         _start_at_zero(ax, rows["score"].to_numpy())
