@@ -185,7 +185,9 @@ def test_partial_results(folder: Path, tmp_path: Path, capsys: pytest.CaptureFix
     (other / "curve.csv").write_text("x,y\n1,2\n")
     failed.mkdir(parents=True)
     (failed / "error.txt").write_text("out of luck")
+    (part / "coordination" / "selections" / ".writing-0-a.json").touch()  # as left by SIGKILL
     page = report(part)
+    assert ".writing" not in page
     assert f"**4 of {N_CELLS} cells are missing**" in page
     assert "- saf TeamTogether c=1, h=1 seed 1: not run yet" in page
     assert f"- ippo TeamSupport c=1, h=1 seed 0: failed, see `{failed / 'error.txt'}`" in page

@@ -238,6 +238,12 @@ def test_a_trained_cell_is_tested_further_without_training(tmp_path: Path) -> No
     assert both == alone
     assert [row["coordination"] for row in both if row["method"] == "qplex"] == ["1", "2", "3"]
     assert {row["train_coordination"] for row in both if row["method"] == "qplex"} == {"2"}
+    (cell,) = (tmp_path / "alone" / "cells").glob("*/qplex/seed-0")
+    (cell / "tests" / "c3-h1.json").write_text("")
+    for levels_shown, missing in (([], "not tested yet at c=3, h=1"), (["--levels", "1"], "")):
+        assert cli.main(["report", "ood-coordination", "-f", str(tmp_path / "alone"), *levels_shown]) == 0
+        page = (tmp_path / "alone" / "ood-coordination" / "report.md").read_text(encoding="utf-8")
+        assert ("are missing" in page) is bool(missing) and missing in page
 
 
 def job_in(folder: Path, method: str = "ippo", tests: int = 1, **options: Any) -> Path:
@@ -581,8 +587,10 @@ def test_a_cell_killed_after_its_model_was_saved_does_not_train_anew(tmp_path: P
         with pytest.raises(RuntimeError, match="struck"):
             run_job(killed)
     assert (killed / "result" / "model.zip").exists()
+    (killed / "result" / "tests" / ".writing-0-c2-h1.json").touch()  # as left by SIGKILL
     assert attempt(killed) <= n_steps / 2
     assert what_counts(whole / "result") == what_counts(killed / "result")
+    assert len(list((killed / "result" / "tests").iterdir())) == 1
 
 
 def test_checkpoints_of_other_settings_are_left_alone_and_finished_cells_keep_none(tmp_path: Path) -> None:

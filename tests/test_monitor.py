@@ -118,6 +118,7 @@ def test_the_file_of_an_earlier_run_is_set_aside_and_a_reset_touches_none(monito
 
 def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint(monitors: Monitors, tmp_path: Path) -> None:
     env = monitors(2)
+    begin = env.checkpoint_state()
     play(env, 2)
     state = env.checkpoint_state()
     for _ in range(2):
@@ -128,6 +129,11 @@ def test_a_resumed_run_cuts_what_it_wrote_after_the_checkpoint(monitors: Monitor
     resumed.load_checkpoint_state(state)
     path = tmp_path / "monitor.csv"
     assert returns_in(path) == [69]
+    anew = monitors(2)
+    anew.reset()
+    anew.load_checkpoint_state(begin)
+    play(anew, 2)
+    assert returns_in(path) == [69] and not list(tmp_path.glob("*.1")), "its own file is no other run's"
     path.unlink()
     for _ in range(2):
         resumed = monitors(2)

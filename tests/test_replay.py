@@ -185,6 +185,21 @@ def test_other_games_are_shown_by_their_pictures_and_names(tmp_path: Path) -> No
     assert len(run["frames"]) == run["steps"] and run["frames"][0].startswith("data:image/png;base64,")
 
 
+@pytest.mark.parametrize(
+    ("frame", "got"), [(np.zeros((4, 4, 4), np.uint8), r"uint8 of shape \(4, 4, 4\)"), (None, "None")]
+)
+def test_games_that_draw_no_pictures_are_refused(frame: Any, got: str, tmp_path: Path) -> None:
+    class Drawn(CounterEnv):
+        def render(self) -> Any:
+            return frame
+
+    env = sb3_saf.make_team_env(Drawn, n_envs=1, seed=0, render_mode="rgb_array")
+    other = PPO("MAPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
+    with pytest.raises(ValueError, match=rf"expected pictures, .*\(height, width, 3\), .* got {got}"):
+        replay(other, env, tmp_path / "page.html")
+    assert not list(tmp_path.iterdir())
+
+
 def test_all_of_many_actions_are_shown(tmp_path: Path) -> None:
     class Many(CounterEnv):
         def action_space(self, agent: str) -> Any:

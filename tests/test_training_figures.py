@@ -12,7 +12,7 @@ from scipy import stats
 from benchmarks.paper import pooled, shares
 from sb3_saf import confidence_interval
 from sb3_saf.experiments.tables import compare, holm, mean_difference
-from sb3_saf.training.figures import draw_curves, draw_levels, method_styles
+from sb3_saf.training.figures import draw_curves, draw_differences, draw_levels, method_styles
 from sb3_saf.training.settings import ALGOS
 from sb3_saf.training.statistics import (
     Estimate,
@@ -53,6 +53,14 @@ def test_a_curve_ends_where_a_seed_ends_and_is_interpolated_between() -> None:
     curve = learning_curve(table)
     assert curve["game_steps"].tolist() == [50, 100, 150]
     assert curve["value"].tolist() == [5.0, 12.5, 20.0]
+
+
+def test_a_method_has_one_colour_in_bars_and_differences() -> None:
+    table = runs(saf=[[1]], mine=[[2]]).assign(level=1)
+    row = {"method": "mine", "level": "1", "value": 0.0, "low": -1.0, "high": 1.0}
+    bars, differences = draw_levels(table, "level"), draw_differences(pd.DataFrame([row]), reference="saf")
+    (line,) = (one for one in differences.axes[0].get_lines() if one.get_marker() == "o")
+    assert to_hex(str(line.get_color())) == to_hex(bars.axes[0].patches[1].get_facecolor())
 
 
 def test_curves_are_drawn_where_they_are() -> None:

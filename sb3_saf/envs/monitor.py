@@ -174,11 +174,16 @@ class TeamMonitor(TeamVecEnvWrapper):
     def _begin_file(self) -> ResultsWriter | None:
         """Create the file at the first step, so that a run that fails earlier touches no file."""
         path, number = self._path(), 1
-        if path is not None and os.path.isfile(path):  # of another run
+        if path is not None and os.path.isfile(path) and not self._is_own(path):
             while os.path.exists(f"{path}.{number}"):
                 number += 1
             os.rename(path, f"{path}.{number}")
         return self._open(override_existing=True)
+
+    def _is_own(self, path: str) -> bool:
+        """Return whether a file is that of this run, killed before its first checkpoint with a file."""
+        with open(path, encoding="utf-8", errors="replace") as file:
+            return f'"t_start": {self.t_start!r},' in file.readline()
 
     def _path(self) -> str | None:
         """Return the path that SB3's ResultsWriter uses."""

@@ -36,7 +36,7 @@ from sb3_saf.experiments.results import (
 )
 from sb3_saf.export.writer import read_weights
 from sb3_saf.teams.checks import CheckpointError, NonFiniteError
-from sb3_saf.teams.files import differences, read_json, write_json, write_text
+from sb3_saf.teams.files import differences, read_json, remove_leftovers, write_json, write_text
 from sb3_saf.training.folders import (
     CHECKPOINTS,
     CURVE,
@@ -96,6 +96,7 @@ def run_job(folder: Path) -> None:
     th.set_num_threads(job.threads)
     cell, result, models, model = job.cell, folder / "result", folder, None
     (result / "tests").mkdir(parents=True, exist_ok=True)
+    remove_leftovers(result / "tests")
     if (folder / MODEL).exists():
         model = _load(job)
     elif cell.is_trained:
@@ -201,7 +202,7 @@ def check_cell(folder: Path, device: str = "auto") -> Check:
     try:
         run, results = Run(folder), Results(folder.resolve().parents[3])
         settings, options, cost = run.description["settings"], run.description["options"], run.finished()
-        levels = [Level.of(**read_json(path)["level"]) for path in sorted(folder.glob("tests/*.json"))]
+        levels = [Level.of(**read_json(path)["level"]) for path in sorted(folder.glob("tests/[!.]*.json"))]
         cell = Cell(options["method"], settings["env"], Level.of(**options["level"]), run.seed, tuple(levels))
         config = results.config()
         if config is None:

@@ -12,6 +12,7 @@ import re
 import shlex
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -95,7 +96,12 @@ def write_report(
     config = results.config()
     assert config is not None
     shown = experiment.at(wanted.levels)
-    cells = [cell for cell in requested(experiment, results) if wanted.has(cell, experiment)]
+    shown_tests = shown.tests()
+    cells = [
+        replace(cell, tests=tuple(level for level in cell.tests if level in shown_tests.get(cell.level, ())))
+        for cell in requested(experiment, results)
+        if wanted.has(cell, experiment)
+    ]
     tests, curves = write_tables(experiment, results)
     names = [(cell.id, level.slug) for cell in cells for level in cell.tests]
     tests = tests[keys_of(tests, "cell", "level").isin(names)] if len(tests) else tests
@@ -163,6 +169,7 @@ def _views(experiment: Experiment, frames: Frames) -> dict[str, Figure]:
                 x_label="difference of team returns, 95 % interval",
                 names=WORDS,
                 band=None if maximum is None else MARGIN * maximum,
+                reference=ours,
             )
     return figures
 
@@ -267,8 +274,10 @@ def _missing(content: Content) -> str:
             f"- **{len(content.missing)} of {len(content.cells)} cells are missing**; numbers below lack them:"
         )
         for cell in content.missing[:_MOST_NAMED]:
+            levels = ", ".join(map(str, results.missing_tests(cell)))
+            state = "not run yet" if results.run(cell) is None else f"not tested yet at {levels}"
             failure = results.failure(cell)
-            lines.append(f"  - {_text(cell)}: {'not run yet' if failure is None else f'failed, see `{failure}`'}")
+            lines.append(f"  - {_text(cell)}: {state if failure is None else f'failed, see `{failure}`'}")
         if len(content.missing) > _MOST_NAMED:
             lines.append(f"  - and {len(content.missing) - _MOST_NAMED} more")
     lines += [f"- damaged: {error}" for error in results.damaged.values()]

@@ -261,7 +261,7 @@ class Results:
 
     def selections(self, experiment: str) -> list[Selection]:
         """Return all requested selections."""
-        paths = sorted((self.folder / experiment / "selections").glob("*.json"))
+        paths = sorted((self.folder / experiment / "selections").glob("[!.]*.json"))
         return sorted((one for path in paths if (one := self._read(path, Selection)) is not None), key=astuple)
 
     def check_experiment(self, experiment: Experiment) -> None:

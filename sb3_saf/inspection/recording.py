@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, ClassVar, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -237,10 +237,16 @@ def return_scale(env: VecEnv) -> ReturnScale:
     return ReturnScale(None if unit is None else str(unit), None if best is None else float(best))
 
 
-def picture(env: VecEnv) -> Picture | None:
-    """Return a picture of the first game, (height, width, 3); None if ``render`` gives none."""
-    frame = np.asarray(env.env_method("render", indices=[0])[0])
-    return frame if frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3 else None
+def picture(frame: object) -> Picture:
+    """Return what ``render`` gave; ValueError if it is no picture, (height, width, 3) uint8."""
+    array = np.asarray(frame)
+    if array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3:
+        return array
+    got = repr(frame) if array.dtype == object or array.ndim == 0 else f"{array.dtype} of shape {array.shape}"
+    raise ValueError(
+        "expected pictures, uint8 of shape (height, width, 3), from render() with render_mode='rgb_array', got "
+        f"{got:.90}"
+    )
 
 
 class EpisodeRecording(NamedTuple):
@@ -394,8 +400,9 @@ class _Recorder:
         is_first = draws and n_episodes >= len(self.lengths_now)  # else the first game may count no episode
 
         def act(obs: Any, _: Bools) -> npt.NDArray[Any]:
-            if is_first and (frame := picture(self.env)) is not None:
-                self.pictures.append(frame)
+            if is_first:
+                with suppress(ValueError):
+                    self.pictures.append(picture(self.env.env_method("render", indices=[0])[0]))
             if has_zones:
                 self.columns["zones"].append(zones_by_attribute(self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None

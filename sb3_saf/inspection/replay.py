@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_saf.evaluation import check_trained_on
 from sb3_saf.inspection.figures import png
-from sb3_saf.inspection.recording import EpisodeRecording, record_episodes
+from sb3_saf.inspection.recording import EpisodeRecording, picture, record_episodes
 from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.files import write_text
 from sb3_saf.teams.rows import TeamSpaces
@@ -100,6 +100,8 @@ def replay(
             rows = slice(game * n_agents, (game + 1) * n_agents)
             ended = recording.ends[:, rows].all(axis=1)
             steps = slice(0, min(int(np.flatnonzero(ended)[0]) + 1, MAX_STEPS))
+            if not has_grid and len(recording.pictures) < steps.stop:
+                picture(env.env_method("render", indices=[0])[0])
             frames = [] if has_grid else [base64.b64encode(png(one)).decode() for one in recording.pictures[steps]]
             run: Packed = {
                 "name": name if episodes == 1 else f"{name}, game {game + 1}",

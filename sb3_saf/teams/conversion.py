@@ -484,16 +484,20 @@ def given_by_game(
     names, conversions = team.names, team.conversions
     agents = _agents_in(team, observation)
     if agents is not None:
-        masks = [mask_in(infos.get(name)) for name in agents]
+        indices = list(range(len(agents))) if names is None else [names.index(name) for name in agents]
+        known = indices if names is not None or len(agents) == team.n_agents else None
+        kinds = None if conversions is None else [conversions[index] for index in indices]
+        # Masks in observations precede those in infos, as in training.
+        masks = [
+            mask_in(infos.get(name)) if kinds is None or kinds[number].mask_key is None else None
+            for number, name in enumerate(agents)
+        ]
         if isinstance(action_masks, Mapping):
             if missing := [name for name in agents if name not in action_masks]:
                 raise ValueError(
                     f"expected a mask of each observed agent, None for all of its actions, got none of {missing}"
                 )
             masks = [action_masks[name] for name in agents]
-        indices = list(range(len(agents))) if names is None else [names.index(name) for name in agents]
-        known = indices if names is not None or len(agents) == team.n_agents else None
-        kinds = None if conversions is None else [conversions[index] for index in indices]
         return _given(team, [observation[name] for name in agents], masks, kinds, known, agents, takes_masks)
     if conversions is None:
         return None

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_saf.evaluation import EvaluationResult, evaluate_team
 from sb3_saf.export.writer import load_weights
 from sb3_saf.inspection.figures import gif
+from sb3_saf.inspection.recording import Picture, picture
 from sb3_saf.suites.registry import find_environment
 from sb3_saf.teams.checks import check_seed, evaluation_seed
 from sb3_saf.teams.vec_env import TeamVecEnvWrapper
@@ -172,8 +173,8 @@ def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | N
         if path.suffix.lower() != ending:
             raise ValueError(f"--{ending[1:]} needs a file that ends with {ending}, got {str(path)!r}")
         path.parent.mkdir(parents=True, exist_ok=True)
-        frames: list[Frame] = []
-        yield frames.append
+        frames: list[Picture] = []
+        yield lambda frame: frames.append(picture(frame))
         write_video(path, frames, fps)
         print(path)
     else:
@@ -181,7 +182,7 @@ def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | N
 
         window = HumanWindow(options.env, fps)
         try:
-            yield lambda frame: window.show(_picture(frame))
+            yield lambda frame: window.show(picture(frame))
         except (ImportError, RuntimeError) as error:
             reason = str(error).partition(";")[0]
             raise RuntimeError(f"{reason}; use --gif FILE, --mp4 FILE, --text, or --no-render") from None
@@ -189,15 +190,8 @@ def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | N
             window.close()
 
 
-def _picture(frame: Frame) -> Any:
-    if not isinstance(frame, np.ndarray):
-        raise ValueError(f"expected pictures from render() with render_mode='rgb_array', got {frame!r}")
-    return frame
-
-
-def write_video(path: Path, frames: Sequence[Frame], fps: int = FPS) -> None:
+def write_video(path: Path, pictures: Sequence[Picture], fps: int = FPS) -> None:
     """Write pictures, (height, width, 3) each, as GIF or MP4, by the path's ending."""
-    pictures = [_picture(frame) for frame in frames]
     if path.suffix.lower() == ".gif":
         path.write_bytes(gif(pictures, 1 / fps))
         return

@@ -234,6 +234,7 @@ def draw_differences(
     x_label: str = "difference",
     names: Mapping[str, str] | None = None,
     band: float | None = None,
+    reference: str | None = None,
 ) -> Figure:
     """
     Draw paired differences with their intervals, one group of lines per level (a forest plot).
@@ -243,9 +244,11 @@ def draw_differences(
     :param panel: column with one panel per value, for instance ``"task"``
     :param names: names of methods in words
     :param band: differences up to this size do not matter; drawn as a grey band
+    :param reference: the method from which the others are subtracted, whose colour is not theirs
     """
     require_columns(compared, ("method", "level", "value", "low", "high"))
-    panels, styles = _panels(compared, panel), method_styles(_methods_of(compared))
+    panels = _panels(compared, panel)
+    styles = method_styles([*_methods_of(compared), *([] if reference is None else [reference])])
     figure, all_axes = _figure(len(panels), height=1.4 + 0.25 * max(len(rows) for _, rows in panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
         places = rows.assign(place=range(len(rows)))
