@@ -186,16 +186,23 @@ def test_other_games_are_shown_by_their_pictures_and_names(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("frame", "got"), [(np.zeros((4, 4, 4), np.uint8), r"uint8 of shape \(4, 4, 4\)"), (None, "None")]
+    ("frames", "message"),
+    [
+        ([np.zeros((4, 4), np.uint8)] * 99, r"\(height, width, 3\), .* got uint8 of shape \(4, 4\)"),
+        ([None] * 99, r"\(height, width, 3\), .* got None"),
+        ([None], "before each of 3 steps, got 2"),
+    ],
 )
-def test_games_that_draw_no_pictures_are_refused(frame: Any, got: str, tmp_path: Path) -> None:
+def test_games_that_draw_no_pictures_are_refused(frames: list[Any], message: str, tmp_path: Path) -> None:
+    given = iter(frames)
+
     class Drawn(CounterEnv):
         def render(self) -> Any:
-            return frame
+            return next(given, np.zeros((4, 4, 4), np.uint8))  # transparent, too
 
     env = sb3_saf.make_team_env(Drawn, n_envs=1, seed=0, render_mode="rgb_array")
     other = PPO("MAPPOPolicy", env, seed=0, device="cpu", **sb3_saf.ppo_settings(env))
-    with pytest.raises(ValueError, match=rf"expected pictures, .*\(height, width, 3\), .* got {got}"):
+    with pytest.raises(ValueError, match=f"expected .*{message}"):
         replay(other, env, tmp_path / "page.html")
     assert not list(tmp_path.iterdir())
 

@@ -55,10 +55,11 @@ def test_a_curve_ends_where_a_seed_ends_and_is_interpolated_between() -> None:
     assert curve["value"].tolist() == [5.0, 12.5, 20.0]
 
 
-def test_a_method_has_one_colour_in_bars_and_differences() -> None:
-    table = runs(saf=[[1]], mine=[[2]]).assign(level=1)
+@pytest.mark.parametrize("reference", ["saf", "others"])
+def test_a_method_has_one_colour_in_bars_and_differences(reference: str) -> None:
+    table = runs(**{reference: [[1.0]], "mine": [[2.0]]}).assign(level=1)
     row = {"method": "mine", "level": "1", "value": 0.0, "low": -1.0, "high": 1.0}
-    bars, differences = draw_levels(table, "level"), draw_differences(pd.DataFrame([row]), reference="saf")
+    bars, differences = draw_levels(table, "level"), draw_differences(pd.DataFrame([row]), reference=reference)
     (line,) = (one for one in differences.axes[0].get_lines() if one.get_marker() == "o")
     assert to_hex(str(line.get_color())) == to_hex(bars.axes[0].patches[1].get_facecolor())
 

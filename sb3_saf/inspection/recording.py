@@ -238,11 +238,12 @@ def return_scale(env: VecEnv) -> ReturnScale:
 
 
 def picture(frame: object) -> Picture:
-    """Return what ``render`` gave; ValueError if it is no picture, (height, width, 3) uint8."""
-    array = np.asarray(frame)
-    if array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3:
-        return array
-    got = repr(frame) if array.dtype == object or array.ndim == 0 else f"{array.dtype} of shape {array.shape}"
+    """Return what ``render`` gave, (height, width, 3), without transparency; ValueError if it is no picture."""
+    got = repr(frame)
+    if isinstance(frame, np.ndarray):
+        if frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] in (3, 4):
+            return frame[..., :3]
+        got = f"{frame.dtype} of shape {frame.shape}"
     raise ValueError(
         "expected pictures, uint8 of shape (height, width, 3), from render() with render_mode='rgb_array', got "
         f"{got:.90}"
@@ -401,8 +402,9 @@ class _Recorder:
 
         def act(obs: Any, _: Bools) -> npt.NDArray[Any]:
             if is_first:
+                frame = self.env.env_method("render", indices=[0])[0]
                 with suppress(ValueError):
-                    self.pictures.append(picture(self.env.env_method("render", indices=[0])[0]))
+                    self.pictures.append(picture(frame))
             if has_zones:
                 self.columns["zones"].append(zones_by_attribute(self.env))
             masks = get_action_masks(self.env) if asks_for_masks else None

@@ -102,6 +102,7 @@ def replay(
             steps = slice(0, min(int(np.flatnonzero(ended)[0]) + 1, MAX_STEPS))
             if not has_grid and len(recording.pictures) < steps.stop:
                 picture(env.env_method("render", indices=[0])[0])
+                raise ValueError(f"expected a picture before each of {steps.stop} steps, got {len(recording.pictures)}")
             frames = [] if has_grid else [base64.b64encode(png(one)).decode() for one in recording.pictures[steps]]
             run: Packed = {
                 "name": name if episodes == 1 else f"{name}, game {game + 1}",

@@ -167,8 +167,6 @@ class QPLEX(OffPolicyAlgorithm):
     # --- setting up -------------------------------------------------------------------------------------------------
 
     def _setup_model(self) -> None:
-        if "update_interval" in vars(self):  # of models that were saved earlier
-            self.train_freq = vars(self).pop("update_interval")
         self._check_settings()
         spaces_ = TeamSpaces.from_observation_space(self.observation_space)
         self.n_agents = spaces_.n_agents

@@ -487,7 +487,7 @@ def given_by_game(
         indices = list(range(len(agents))) if names is None else [names.index(name) for name in agents]
         known = indices if names is not None or len(agents) == team.n_agents else None
         kinds = None if conversions is None else [conversions[index] for index in indices]
-        # Masks in observations precede those in infos, as in training.
+        # Where the game has masks in observations, infos are not read, as in training.
         masks = [
             mask_in(infos.get(name)) if kinds is None or kinds[number].mask_key is None else None
             for number, name in enumerate(agents)

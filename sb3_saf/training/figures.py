@@ -32,7 +32,7 @@ from sb3_saf.training.statistics import (
 
 #: Letters in a line of a panel's title.
 _TITLE_WIDTH: Final = 48
-#: Colours distinguishable by colour-blind readers (Okabe and Ito, and three darker ones).
+#: Colours distinguishable by colour-blind readers (Okabe and Ito, and darker ones).
 _COLOURS: Final = {
     "saf": "#0072B2",
     "mappo": "#E69F00",
@@ -248,7 +248,7 @@ def draw_differences(
     """
     require_columns(compared, ("method", "level", "value", "low", "high"))
     panels = _panels(compared, panel)
-    styles = method_styles([*_methods_of(compared), *([] if reference is None else [reference])])
+    styles = method_styles([*([] if reference is None else [reference]), *_methods_of(compared)])
     figure, all_axes = _figure(len(panels), height=1.4 + 0.25 * max(len(rows) for _, rows in panels))
     for ax, (name, rows) in zip(all_axes, panels, strict=True):
         places = rows.assign(place=range(len(rows)))
