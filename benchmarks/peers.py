@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, Final, NamedTuple
 
 FILE: Final = Path("results", "suites_baselines.csv")
@@ -48,6 +48,8 @@ _MEMORY_TASK: Final = "3m"
 _MEMORY_UNITS: Final = 128
 _MEMORY_STEPS: Final = 50_000
 _MEMORY_GAMES: Final = (64, 256)
+#: JaxMARL's program of values, whose settings for these games are in a file of another name.
+_PQN: Final = "pqn_vdn_ff"
 _RATES: Final = ("feedforward", "memory", "trainings")
 
 
@@ -61,6 +63,7 @@ class Peer(NamedTuple):
     :param own_task: their name of the task
     :param algorithm: their name of the method
     :param game_steps: of one training
+    :param settings: what differs from the program's own settings
     """
 
     task: str
@@ -69,6 +72,7 @@ class Peer(NamedTuple):
     own_task: str
     algorithm: str
     game_steps: int
+    settings: Mapping[str, float] = MappingProxyType({})
 
 
 class Outcome(NamedTuple):
@@ -99,6 +103,16 @@ PEERS: Final = (
         Peer(f"jaxmarl/{_SPREAD}", "JaxMARL's IPPO", "jaxmarl", _SPREAD, "ippo_ff_mpe", game_steps)
         for game_steps in (200_000, 10_000_000)
     ),
+    Peer(
+        f"jaxmarl/{_SPREAD}",
+        "JaxMARL's IPPO with a discount of 0.9",
+        "jaxmarl",
+        _SPREAD,
+        "ippo_ff_mpe",
+        10_000_000,
+        {"GAMMA": 0.9},
+    ),
+    Peer(f"jaxmarl/{_SPREAD}", "JaxMARL's PQN-VDN", "jaxmarl", _SPREAD, _PQN, 10_000_000),
     *(
         Peer(f"smax/{battle}", "JaxMARL's IPPO", "jaxmarl", battle, "ippo_rnn_smax", 10_000_000)
         for battle in ("2s3z", "3s_vs_5z")
@@ -134,21 +148,22 @@ def _open_jaxmarl(algorithm: str, clone: Path, logged: list[Mapping[str, Any]]) 
     _replace("wandb", log=logged.append)
     _replace("hydra", main=lambda **_: lambda function: function)
     sys.path.insert(0, str(clone))
-    text = (clone / "baselines" / "IPPO" / "config" / f"{algorithm}.yaml").read_text(encoding="utf-8")
+    folder, name = ("QLearning", f"alg/{_PQN}_mpe") if algorithm == _PQN else ("IPPO", algorithm)
+    text = (clone / "baselines" / folder / "config" / f"{name}.yaml").read_text(encoding="utf-8")
     config = import_module("yaml").safe_load(text.replace("${oc.env:WANDB_ENTITY}", "none"))
-    return import_module(f"baselines.IPPO.{algorithm}"), {name: _number(value) for name, value in config.items()}
+    return import_module(f"baselines.{folder}.{algorithm}"), {key: _number(value) for key, value in config.items()}
 
 
 def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
     """
-    Run a baseline of JaxMARL and average its last training episodes.
+    Run a baseline of JaxMARL and average its last training episodes, of values take its last test with best actions.
 
     Its own settings fall over the run: learning rate, shaped rewards (to 0 after the same share of the run).
     """
     logged: list[Mapping[str, Any]] = []
     program, config = _open_jaxmarl(peer.algorithm, clone, logged)
     share = peer.game_steps / config["TOTAL_TIMESTEPS"]
-    config |= {"TOTAL_TIMESTEPS": peer.game_steps, "SEED": seed, "NUM_SEEDS": 1}
+    config |= {"TOTAL_TIMESTEPS": peer.game_steps, "SEED": seed, "NUM_SEEDS": 1, **peer.settings}
     if "MAP_NAME" in config:
         config["MAP_NAME"] = peer.own_task
     elif "REW_SHAPING_HORIZON" in config:
@@ -158,6 +173,13 @@ def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
     else:
         config["ENV_NAME"] = peer.own_task
     jax = import_module("jax")
+    ran = f"`make_train` of baselines/{{}}/{peer.algorithm}.py at {_commit(clone)}, jax {jax.__version__}"
+    if peer.algorithm == _PQN:
+        config["WANDB_MODE"] = "disabled"
+        env, _ = program.env_from_config(dict(config))
+        _, _, test, _ = jax.jit(program.make_train(config, env))(jax.random.PRNGKey(seed))["runner_state"]
+        value = float(test["returned_episode_returns"])
+        return Outcome(value, None, f"{ran.format('QLearning')}; {config['TEST_NUM_ENVS']} games, best actions")
     jax.block_until_ready(jax.jit(program.make_train(config))(jax.random.PRNGKey(seed)))
 
     def last(name: str) -> float:
@@ -165,9 +187,8 @@ def train_jaxmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
         return sum(values) / len(values)
 
     value = last("returned_episode_returns" if "returned_episode_returns" in logged[-1] else "returns")
-    commit = _commit(clone)
-    source = f"`make_train` of baselines/IPPO/{peer.algorithm}.py at {commit}, jax {jax.__version__}; training episodes"
-    return Outcome(value, last("win_rate") if "win_rate" in logged[-1] else None, source)
+    won = last("win_rate") if "win_rate" in logged[-1] else None
+    return Outcome(value, won, f"{ran.format('IPPO')}; training episodes")
 
 
 def train_benchmarl(peer: Peer, seed: int, clone: Path) -> Outcome:
