@@ -236,9 +236,12 @@ class TeamEvalCallback(EvalCallback):
         """Play, store and log; return whether training continues."""
         began = time.monotonic()
         copy_normalization(self.training_env, self.eval_env)
-        result = evaluate_team(
-            self.model, self.eval_env, self.n_eval_episodes, self.deterministic, render=self.render, warn=self.warn
-        )
+        try:
+            result = evaluate_team(
+                self.model, self.eval_env, self.n_eval_episodes, self.deterministic, render=self.render, warn=self.warn
+            )
+        except NonFiniteError as error:
+            raise NonFiniteError(f"in the evaluation, {error}") from error
         self.last_mean_reward = result.mean
         self._store(result)
         self._log(result)

@@ -107,6 +107,9 @@ def test_nothing_is_learned_from_bad_losses_and_those_of_before_are_named() -> N
     assert weights_of(model) == before
     with pytest.raises(NonFiniteError, match=r"\(the update before had .*train/value_loss \d.*train/loss -?\d.*\)"):
         ppo().learn(3 * ROLLOUT, [FiniteCallback(), SpoiledLater()])
+    bad, fine = spoiled("rewards", float("nan"), 6), spoiled("nothing", 0.0, 0)
+    with pytest.raises(NonFiniteError, match=r"^in the evaluation, rewards must be finite, got nan at step 6"):
+        ppo(fine).learn(ROLLOUT, TeamEvalCallback(bad, eval_freq=1, n_eval_episodes=3, warn=False))
 
 
 class SpoiledLater(BaseCallback):

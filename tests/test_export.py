@@ -315,14 +315,38 @@ def test_agents_of_any_name_keep_their_own_memory_while_they_play(tmp_path: Path
             parameter.add_(0.5 * th.randn_like(parameter))
     actor = Actor.load(export_actors(model, tmp_path))
     game, memory, state = Named(names), actor.new_memory(), None
+    alone: dict[Any, Any] = {}
     observations, _ = game.reset()
     while game.agents:
         turned = {agent: observations[agent] for agent in reversed(game.agents)}
+        going = dict.fromkeys(turned, False)
+        with_starts, _ = model.predict(turned, state, going, deterministic=True)
         expected, state = model.predict(turned, state, deterministic=True)
+        assert repr(with_starts) == repr(expected)
+        assert repr(model.predict(turned, state, dict.fromkeys(turned, True), deterministic=True)) == repr(
+            model.predict(turned, deterministic=True)
+        )
+        alone = {agent: alone.get(agent) or actor.new_memory() for agent in turned}  # those that waited begin anew
+        likelihoods = actor.log_prob(turned, expected, memory=memory)
+        for likelihood, (agent, own) in zip(likelihoods, turned.items(), strict=True):
+            single = Actor(actor.session, actor.description, names.index(agent))
+            assert single.log_prob(own, expected[agent], memory=alone[agent]) == pytest.approx(likelihood, abs=1e-4)
+            single.act(own, memory=alone[agent])
         acted = actor.act(turned, memory=memory)
         assert acted == {agent: pytest.approx(action, rel=1e-4, abs=1e-5) for agent, action in expected.items()}
         observations, *_ = game.step(expected)
         observations = {agent: game.see(agent) for agent in game.agents}
+    rows = np.stack(list(turned.values()))
+    for call in (
+        lambda: model.predict(rows, state),
+        lambda: model.predict(turned, (np.zeros((2, 8)),)),
+    ):
+        with pytest.raises(ValueError, match="state in the form of observations"):
+            call()
+    with pytest.raises(ValueError, match="expected episode_start of 1 rows, one for each agent, got 4"):
+        model.predict({"obs": rows, "agent": [0] * len(rows)}, None, np.zeros(4))
+    with pytest.raises(ValueError, match=r"observations in the form of the episode so far.*make a new memory"):
+        Actor(actor.session, actor.description, 0).act(rows[0], memory=memory)
 
 
 def test_names_that_cannot_be_written_are_refused(tmp_path: Path) -> None:

@@ -630,6 +630,19 @@ def test_a_game_that_ignores_its_seed_is_named(draws: bool) -> None:
         check_team_env(Stubborn())
 
 
+def test_a_game_that_begins_at_random_after_its_seed_is_named() -> None:
+    class Forgetful(Game):
+        def reset(self, seed: int | None = None, options: Any = None) -> Any:
+            self.rng = np.random.default_rng(seed)
+            return super().reset(seed, options)
+
+        def see(self, agent: Any) -> Any:
+            return self.rng.uniform(-1, 1, 2).astype(np.float32)
+
+    with pytest.warns(UserWarning, match="of a differ in two resets with the seed 0, each followed by one without: "):
+        check_team_env(Forgetful())
+
+
 def test_statistics_of_observations_leave_out_the_dead() -> None:
     class Dying(Game):
         length = 20
@@ -980,6 +993,22 @@ def test_who_waits_has_one_action_that_nobody_reads(kwargs: dict[str, Any]) -> N
     assert env.unwrapped.moves == moves == [0, 1, 0, 1, 0], "the pile went 6, 4, 3, 1, 0"
     assert rewards == {"first": 1.0, "second": -1.0}
     assert terminations == {"first": True, "second": True}
+
+
+class Dealt(Nim):
+    """Draws the pile at random after a game with a seed, as OpenSpiel does, and tells masks in infos, too."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        super().reset(seed, options)
+        self.pile = int(np.random.default_rng(seed).integers(1, 8))
+        self.infos = {agent: {"action_mask": np.zeros(3, np.int8)} for agent in self.agents}
+
+
+def test_games_after_one_with_a_seed_repeat() -> None:
+    envs = [TurnsInParallel(Dealt()) for _ in range(2)]
+    piles = [[(env.reset(seed=seed), env.unwrapped.pile)[1] for seed in (5, *[None] * 9)] for env in envs]
+    assert piles[0] == piles[1] and len(set(piles[0])) > 1
+    check_team_env(envs[0])  # infos are not read where observations have masks: warnings are errors
 
 
 def test_it_is_a_proper_parallel_env() -> None:

@@ -19,7 +19,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from sb3_saf import QPLEX, Actor, GameStepsCallback, LightEncoder, evaluate_team, export_actors, make_team_env
+from sb3_saf import PQN, QPLEX, Actor, GameStepsCallback, LightEncoder, evaluate_team, export_actors, make_team_env
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper, TimeLimit
 from sb3_saf.qplex.learning import team_errors
 from sb3_saf.qplex.mixers import JointChoice, Mixer, QMIXMixer, QPLEXMixer, VDNMixer
@@ -341,6 +341,8 @@ def test_replay_buffers_of_other_teams_are_refused(tmp_path: Path) -> None:
         with pytest.warns(UserWarning, match="unpickled"), pytest.raises(ValueError, match=words):
             model.load_replay_buffer(tmp_path / "buffer")
         assert model._buffer().n_envs == model.n_envs
+    with pytest.raises(ValueError, match="PQN keeps no steps between rollouts"):
+        PQN("PQNPolicy", toy_env(2)).load_replay_buffer(tmp_path / "buffer")
 
 
 # --- export; with masks and heads: test_pqn.py ------------------------------------------------------------------------

@@ -231,6 +231,15 @@ def test_environments_by_other_names(tmp_path: Path) -> None:
         assert find_environment("own/counter-v0").folder_name == "own-counter-v0"
     finally:
         del pettingzoo.parallel_registry["own/counter-v0"]
+    pettingzoo.register("aec", "own/missing-v0", "no_such_module:env")
+    try:
+        with pytest.raises(ValueError, match="Failed to import entry point 'no_such_module:env'"):
+            find_environment("own/missing-v0").make_game({})
+    finally:
+        del pettingzoo.aec_registry["own/missing-v0"]
+    turns = find_environment("classic/tictactoe-v3").make_game({})
+    turns.reset(seed=0)
+    assert turns.step({"player_1": 4, "player_2": 0})[0]["player_2"]["action_mask"].tolist() == [1] * 4 + [0] + [1] * 4
 
 
 def test_wrappers_of_rl_zoo3(tmp_path: Path) -> None:

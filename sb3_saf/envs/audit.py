@@ -44,7 +44,8 @@ def check_team_env(env: Any, n_steps: int = 1000, seconds: float = 10.0) -> None
     Check that a game gives what ``make_team_env`` needs, by playing random legal actions, as SB3's ``check_env`` does.
 
     Agents, spaces, observations, rewards, ends, infos and action masks are checked until the first episode ends, then
-    two resets with one seed are compared. ``make_team_env`` checks 30 steps, on a copy of the game.
+    games that begin with one seed, and those that follow them, are compared. ``make_team_env`` checks 30 steps, on a
+    copy of the game.
 
     :param env: PettingZoo ParallelEnv or Gymnasium environment of several agents, which is reset and played, or a
         function that makes one
@@ -169,16 +170,17 @@ class Trial:
                     self._note(respawned)
 
     def check_seed(self) -> None:
-        """Note that first observations differ in two resets with one seed."""
+        """Note that first observations differ in two resets with one seed, or in those without that follow them."""
         with own_randomness(0):
-            results = [self._called(reset, self.env, 0, None) for _ in range(2)]
-        for agent in () if None in results else self._playing(frozenset()):
-            seen = [read_leaves(self._leaves[agent], given[agent]) for given, _ in results if agent in given]
-            if len(seen) < 2 or not all(map(np.array_equal, *seen)):
-                return self._note(
-                    f"first observations of {agent} differ in two resets with the seed 0: draw from reset's seed, so "
-                    "that evaluations play the same games again and runs can be repeated"
-                )
+            results = [self._called(reset, self.env, seed, None) for seed in (0, None, 0, None)]
+        for where, pair in {"": results[::2], ", each followed by one without": results[1::2]}.items():
+            for agent in () if None in results else self._playing(frozenset()):
+                seen = [read_leaves(self._leaves[agent], given[agent]) for given, _ in pair if agent in given]
+                if len(seen) < 2 or not all(map(np.array_equal, *seen)):
+                    return self._note(
+                        f"first observations of {agent} differ in two resets with the seed 0{where}: draw from the "
+                        "last seed, so that evaluations play the same games again and runs can be repeated"
+                    )
 
     def _called(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call the game; return None if it fails."""
@@ -215,7 +217,8 @@ class Trial:
                     )
             self.n_turns[agent] += agent in playing
             key = next((name for name in MASK_NAMES if info.get(name) is not None), None)
-            if agent in playing and key is not None and n_mask_entries(self.actions[agent]) is not None:
+            is_read = self.mask_keys[agent] is None and n_mask_entries(self.actions[agent]) is not None
+            if agent in playing and is_read and key is not None:
                 self._check_mask(agent, key, info[key], "info")
                 self.n_masks[agent] += 1
 

@@ -34,8 +34,10 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
 
         env = sb3_saf.make_team_env(lambda: sb3_saf.TurnsInParallel(hanabi_v5.env(colors=2, players=2)), n_envs=16)
 
-    Seeds are taken modulo 2^31. Rewards come at the step at which the game gives them, also to agents that wait; a
-    warning says if their sum until an agent's next turn is not what the game's ``last`` gives it then.
+    Seeds are taken modulo 2^31. After a game with a seed, those that follow draw theirs from it, so that they repeat
+    also where the game itself would begin at random. Rewards come at the step at which the game gives them, also to
+    agents that wait; a warning says if their sum until an agent's next turn is not what the game's ``last`` gives it
+    then.
 
     :param env: an AECEnv whose agents act one after another, with Discrete actions
     :raises ValueError: if it is no AECEnv, or its actions are not Discrete
@@ -50,6 +52,7 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
             )
         super().__init__(turn_based_aec_to_parallel(env))
         self._aec = env
+        self._rng: np.random.Generator | None = None
         #: By agent: rewards since its last turn began; None after the warning that ``last`` gives others.
         self._paid: Counter[Any] | None = Counter()
         self._n_actions: dict[Any, int] = {}
@@ -61,7 +64,12 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin a game (see PettingZoo)."""
-        observations, infos = super().reset(None if seed is None else seed % _SEEDS, options)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+            seed %= _SEEDS
+        elif self._rng is not None:
+            seed = int(self._rng.integers(_SEEDS))
+        observations, infos = super().reset(seed, options)
         self._paid = None if self._paid is None else Counter()
         return self._with_masks(observations, infos)
 

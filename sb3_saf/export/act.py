@@ -266,8 +266,10 @@ class Actor:
     ) -> tuple[dict[str, Array], bool, Given | None]:
         """Return the graph's inputs for an observation of any form, whether they are a batch, and what was given."""
         rows, given = self._rows(observation, action_mask)
-        inputs, is_batch = self._inputs(rows, self._states(memory))
-        return inputs, is_batch and (given is None or given.agents is not None), given
+        by_agent = given is not None and given.agents is not None
+        states = self._states(memory, by_agent)
+        inputs, is_batch = self._inputs(rows, states if given is None else given.memory(states)[0])
+        return inputs, is_batch and (given is None or by_agent), given
 
     def _inputs(self, rows: Mapping[str, Any], states: Any) -> tuple[dict[str, Array], bool]:
         """Return the checked inputs of the graph by name, and whether they are a batch."""
@@ -337,7 +339,7 @@ class Actor:
             raise ValueError(f"expected at least one legal action in each action_mask, got {mask.astype(int).tolist()}")
         return mask
 
-    def _states(self, memory: Memory | None, by_agent: bool = False) -> Any:
+    def _states(self, memory: Memory | None, by_agent: bool) -> Any:
         """Return the states of a memory, (K, ...) each, or those of agents by name; None if it is new."""
         if self.has_memory and not isinstance(memory, Memory):
             raise ValueError(
@@ -347,6 +349,11 @@ class Actor:
             return None
         if not self.has_memory:
             self.new_memory()  # raises an error: the actor has no memory
+        if any(isinstance(state, tuple) != by_agent for state in memory.states.values()):
+            raise ValueError(
+                "expected observations in the form of the episode so far, all of them {agent: observation} or none: "
+                "make a new memory for each episode"
+            )
         return (memory.states if by_agent else tuple(memory.states.values())) or None
 
 

@@ -124,16 +124,18 @@ class TeamRowsPolicy(BasePolicy):
             actions are those of the game. A model trained on tile codes also takes the pixels of the same game
         :param state: what agents with memory remember, as in SB3; of observations by agent, the state returned for the
             step before, ``{agent: state}``. None where episodes begin; agents that it lacks begin
-        :param episode_start: as in SB3
+        :param episode_start: as in SB3, of observations by agent also ``{agent: bool}``
         :param deterministic: as in SB3
         :param action_masks: of policies with masks in the form of the observation, with None for an agent that may do
             everything; of MaskablePPO's also for rows
         :return: actions and the next state; ``{agent: action}`` for observations by agent
-        :raises ValueError: for masks that the policy cannot take
+        :raises ValueError: for masks that the policy cannot take, and for states and starts of other rows
         """
         given = self.given_by_game(observation, action_masks)
         if given is not None:
             return given.act(self._predict_rows, state, episode_start, deterministic)
+        if isinstance(state, Mapping):
+            raise ValueError("expected state in the form of observations, that of rows, got one by agent")
         if isinstance(observation, Mapping):  # critics' entries have shapes that depend on the size of the team
             unread = {TEAM_KEY, ACTIVE_KEY, STATE_KEY} | (set() if self.acts_by_index else {AGENT_KEY})
             observation = {key: value for key, value in observation.items() if key not in unread}
@@ -230,7 +232,10 @@ class TeamRowsPolicy(BasePolicy):
         if not isinstance(obs, th.Tensor) and EPISODE_START_KEY in obs:
             starts = obs[EPISODE_START_KEY].reshape(-1) != 0
         if episode_start is not None:
-            starts = starts | th.as_tensor(np.reshape(episode_start, -1).astype(bool), device=self.device)
+            begins = np.reshape(episode_start, -1).astype(bool)
+            if len(begins) not in (1, n_rows):
+                raise ValueError(f"expected episode_start of {n_rows} rows, one for each agent, got {len(begins)}")
+            starts = starts | th.as_tensor(begins, device=self.device)
         return starts
 
     def _action_mask(self, obs: PyTorchObs) -> th.Tensor | None:

@@ -172,6 +172,10 @@ class PQN(QPLEX):
     def _on_step(self) -> None:
         self._update_exploration_rate()
 
+    def load_replay_buffer(self, path: object, truncate_last_traj: bool = True) -> None:
+        """Raise ValueError: a rollout is used once, so no steps are kept."""
+        raise ValueError("PQN keeps no steps between rollouts, so it loads no replay buffer: leave it out")
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """
         Learn from the rollout, if it is complete.

@@ -28,11 +28,13 @@ from typing import Any, Final, Literal, NamedTuple
 import pettingzoo
 import yaml
 from packaging.requirements import Requirement
+from pettingzoo.env_registry.exceptions import FailedToImport
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_saf.suites
 from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.gymnasium_team import as_parallel
+from sb3_saf.envs.turns import TurnsInParallel
 from sb3_saf.teams.checks import import_by_name
 
 #: Reduction of the rewards of a team's agents to one number.
@@ -268,6 +270,14 @@ class TeamEnvironment:
             )
 
 
+def _make_registered(kind: str, name: str, **kwargs: Any) -> Any:
+    try:
+        game = pettingzoo.make(kind, name, **kwargs)
+    except FailedToImport as error:
+        raise ValueError(str(error)) from error
+    return TurnsInParallel(game) if kind == "aec" else game
+
+
 def find_environment(name: str) -> TeamEnvironment:
     """
     Look up an environment.
@@ -283,8 +293,9 @@ def find_environment(name: str) -> TeamEnvironment:
             raise suite.unknown_task(task)
         make = None if suite.game is None else partial(suite.game, found)
         return TeamEnvironment(found if suite.name == HOME else f"{suite.name}/{found}", make, suite, found)
-    if name in pettingzoo.parallel_registry:
-        return TeamEnvironment(name, partial(pettingzoo.make, "parallel", name))
+    for kind, registry in {"parallel": pettingzoo.parallel_registry, "aec": pettingzoo.aec_registry}.items():
+        if name in registry:
+            return TeamEnvironment(name, partial(_make_registered, kind, name))
     is_module = False
     with suppress(ImportError, ValueError):
         is_module = name.isidentifier() and find_spec(name) is not None

@@ -430,6 +430,20 @@ class Given(NamedTuple):
             actions = [one.row_action_of(own) for one, own in zip(self.conversions, actions, strict=True)]
         return np.stack([np.asarray(own) for own in actions])
 
+    def memory(self, state: Any, episode_start: Any = None) -> tuple[Any, Any]:
+        """Return the memory of rows, and which rows begin, (B,), from those by agent if the observations are."""
+        agents = self.agents
+        if agents is not None and isinstance(episode_start, Mapping):
+            episode_start = [bool(episode_start.get(agent)) for agent in agents]
+        if state and isinstance(state, Mapping) != (agents is not None):
+            raise ValueError("expected state in the form of observations, both by agent or none, got only one of them")
+        if agents is None or not state:
+            return state or None, episode_start
+        blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
+        memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
+        starts = np.array([agent not in state for agent in agents])
+        return memory, starts if episode_start is None else starts | np.asarray(episode_start).astype(bool)
+
     def act(
         self, predict: Callable[..., tuple[Any, Any]], state: Any, episode_start: Any, deterministic: bool
     ) -> tuple[Any, Any]:
@@ -438,15 +452,8 @@ class Given(NamedTuple):
 
         :param predict: acts on rows, as SB3's ``predict``, whose arguments the others are
         """
-        agents, memory, starts = self.agents, state, episode_start
-        if agents is not None and not state:
-            memory = None
-        elif agents is not None:
-            blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
-            memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
-            starts = np.array([agent not in state for agent in agents])
-            if episode_start is not None:
-                starts |= np.asarray(episode_start).astype(bool)
+        agents = self.agents
+        memory, starts = self.memory(state, episode_start)
         masks = {} if self.action_masks is None else {"action_masks": self.action_masks}
         actions, after = predict(self.rows, memory, starts, deterministic, **masks)
         of_game = list(actions)
