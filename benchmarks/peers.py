@@ -112,7 +112,10 @@ PEERS: Final = (
         10_000_000,
         {"GAMMA": 0.9},
     ),
-    Peer(f"jaxmarl/{_SPREAD}", "JaxMARL's PQN-VDN", "jaxmarl", _SPREAD, _PQN, 10_000_000),
+    *(
+        Peer(f"jaxmarl/{game}", "JaxMARL's PQN-VDN", "jaxmarl", game, _PQN, 10_000_000)
+        for game in (_SPREAD, "MPE_simple_speaker_listener_v4")
+    ),
     *(
         Peer(f"smax/{battle}", "JaxMARL's IPPO", "jaxmarl", battle, "ippo_rnn_smax", 10_000_000)
         for battle in ("2s3z", "3s_vs_5z")

@@ -74,7 +74,7 @@ class Task(NamedTuple):
 TASKS: Final = (
     Task("mpe/simple_spread_v3", 1_000_000, (*METHODS, "pqn")),
     Task("jaxmarl/MPE_simple_spread_v3", 10_000_000, (*METHODS, "pqn")),
-    Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000),
+    Task("jaxmarl/MPE_simple_speaker_listener_v4", 10_000_000, (*METHODS, "pqn")),
     Task("vmas/balance", 10_000_000),
     *(  # BenchMARL's games
         Task(f"vmas/{scenario}", game_steps, params=params, folder=f"vmas-{scenario}-of-benchmarl-{game_steps}")
