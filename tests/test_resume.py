@@ -401,6 +401,21 @@ def test_ctrl_c_stops_qplex_at_the_next_step_and_the_second_one_at_once(
         assert f"checkpoint-{saved_at * N_GAMES:012d}.ckpt is saved" in capsys.readouterr().out
 
 
+def test_signals_at_the_end_of_qplex_are_heard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    class AtTheEnd(Lightning):
+        def _on_training_end(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(SystemExit):
+        resumable_learn(qplex(), WHOLE, tmp_path, AtTheEnd(-1))
+    assert "is saved; start the same command again" in capsys.readouterr().out
+
+
+def test_steps_are_counted_from_the_beginning_of_the_run(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="counts the whole run, which begins at 0 also with a trained model"):
+        resumable_learn(make(), WHOLE, tmp_path, reset_num_timesteps=False)
+
+
 def foreign(game: type[CounterEnv], n_cpus: int = 1, seed: int | None = 3) -> Any:
     env = sb3_saf.make_team_env(functools.partial(game, max_cycles=5), N_GAMES, seed=3, n_cpus=n_cpus)
     return make(env=env, seed=seed, policy_kwargs={"net_arch": [8]})
