@@ -235,7 +235,7 @@ class TeamEnvironment:
         assert self.suite is not None and self.suite.vec_env is not None
         try:
             venv: VecEnv = self.suite.vec_env(self.task, n_envs, seed, **options, **params)
-        except TypeError as error:  # most often an argument that it does not have
+        except (TypeError, AssertionError) as error:  # most often an argument that it does not have
             raise ValueError(f"{self.id} cannot be made with {dict(params)}: {error}") from error
         return venv
 

@@ -20,6 +20,7 @@ with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
     from vmas.simulator.environment import Environment
 
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
+from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array, TeamSpaces
 
 _ONE_AGENT: Final = "simple"
@@ -179,6 +180,8 @@ def vec_env(
     """
     if state:
         raise ValueError(f"vmas/{scenario} tells no state of the game; leave state=True out")
+    if max_steps is not None:
+        check_count("max_steps", max_steps)
     with warnings.catch_warnings(record=True) as said, _gpus_left_alone(device):
         warnings.simplefilter("always")
         env = vmas.make_env(
@@ -190,6 +193,8 @@ def vec_env(
             seed=0,
             clamp_actions=True,
             terminated_truncated=True,
+            dict_spaces=False,
+            multidiscrete_actions=False,
             **params,
         )
     for warning in said:
