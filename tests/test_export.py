@@ -340,9 +340,14 @@ def test_agents_of_any_name_keep_their_own_memory_while_they_play(tmp_path: Path
     for call in (
         lambda: model.predict(rows, state),
         lambda: model.predict(turned, (np.zeros((2, 8)),)),
+        lambda: model.predict(rows, None, dict.fromkeys(names, False)),
     ):
-        with pytest.raises(ValueError, match="state in the form of observations"):
+        with pytest.raises(ValueError, match="in the form of observations"):
             call()
+    with pytest.raises(ValueError, match="expected episode_start of each observed agent, got none of"):
+        model.predict(turned, state, {"zz": True})
+    with pytest.raises(ValueError, match="expected episode_start of 1 agents, got 4"):
+        model.predict(turned, state, np.zeros(4))
     with pytest.raises(ValueError, match="expected episode_start of 1 rows, one for each agent, got 4"):
         model.predict({"obs": rows, "agent": [0] * len(rows)}, None, np.zeros(4))
     with pytest.raises(ValueError, match=r"observations in the form of the episode so far.*make a new memory"):

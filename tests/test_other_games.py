@@ -622,12 +622,40 @@ def test_a_game_that_ignores_its_seed_is_named(draws: bool) -> None:
     if draws:
         with pytest.warns(UserWarning, match=r"ignore reset\(seed"):
             env.step(np.zeros(4, int))
-        for game, agent in ((Stubborn(), "a"), (Alternating(), "[ab]")):
+        for game, agent in ((Stubborn(), "a"), (Alternating(), "[ab]"), (Toggling(), "a")):
             with pytest.warns(UserWarning, match=f"first observations of {agent} differ in two resets with the seed 0"):
                 check_team_env(game)
     else:
         env.step(np.zeros(4, int))  # a game without chance: warnings are errors
         check_team_env(Stubborn())
+
+
+class Toggling(Game):
+    """Changes sides at each reset, whatever the seed."""
+
+    n_resets = 0
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.n_resets += 1
+        return super().reset(seed, options)
+
+    def see(self, agent: Any) -> Any:
+        return np.full(2, self.n_resets % 2, np.float32)
+
+
+class Lineup(Game):
+    """Draws who plays from its seed."""
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        if seed is not None:
+            self.rng = np.random.default_rng(seed)
+        observations, infos = super().reset(seed, options)
+        self.agents = [self.possible_agents[int(self.rng.integers(2))]]
+        return {agent: observations[agent] for agent in self.agents}, {agent: infos[agent] for agent in self.agents}
+
+
+def test_games_that_draw_who_plays_are_fine() -> None:
+    check_team_env(Lineup())
 
 
 def test_a_game_that_begins_at_random_after_its_seed_is_named() -> None:

@@ -423,13 +423,13 @@ def resumable_learn(
     :param exact: see :class:`TeamCheckpointCallback`
     :param trust_games: see :func:`resume`
     :param again: advice in the message after Ctrl-C and SIGTERM
-    :param learn_arguments: further arguments of ``model.learn``, but not ``reset_num_timesteps``
+    :param learn_arguments: further arguments of ``model.learn``
     :return: the model
     :raises CheckpointError: see :func:`resume`; also if another run uses the folder
-    :raises ValueError: for ``reset_num_timesteps``
+    :raises ValueError: for ``reset_num_timesteps=False``
     :raises NonFiniteError: at NaN or infinity, naming the step, the tensor, and the last valid checkpoint
     """
-    if "reset_num_timesteps" in learn_arguments:
+    if not learn_arguments.pop("reset_num_timesteps", True):
         raise ValueError(
             "leave out reset_num_timesteps: total_timesteps counts the whole run, which begins at 0 also with a "
             "trained model"
@@ -481,7 +481,7 @@ def _saved_on_interrupt(checkpoints: TeamCheckpointCallback, at_rollout: bool, a
     with handled({signal.SIGTERM, signal.SIGINT} if at_rollout else {signal.SIGTERM}, handle):
         try:
             yield
-            if checkpoints._stop is not None:  # in the last rollout
+            if checkpoints._stop is not None:  # heard after the start of the last rollout
                 checkpoints._stop()
         except (KeyboardInterrupt, SystemExit):
             if path := newest():

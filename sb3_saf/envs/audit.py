@@ -172,15 +172,22 @@ class Trial:
     def check_seed(self) -> None:
         """Note that first observations differ in two resets with one seed, or in those without that follow them."""
         with own_randomness(0):
-            results = [self._called(reset, self.env, seed, None) for seed in (0, None, 0, None)]
-        for where, pair in {"": results[::2], ", each followed by one without": results[1::2]}.items():
-            for agent in () if None in results else self._playing(frozenset()):
-                seen = [read_leaves(self._leaves[agent], given[agent]) for given, _ in pair if agent in given]
-                if len(seen) < 2 or not all(map(np.array_equal, *seen)):
+            games = [self._called(self._first_observations, seed) for seed in (0, 0, None, 0, None)]
+        if None in games:
+            return
+        for where, (one, other) in {"": games[:2], ", each followed by one without": games[2::2]}.items():
+            for agent in self.agents:
+                seen = [game[agent] for game in (one, other) if agent in game]
+                if seen and (len(seen) < 2 or not all(map(np.array_equal, *seen))):
                     return self._note(
                         f"first observations of {agent} differ in two resets with the seed 0{where}: draw from the "
                         "last seed, so that evaluations play the same games again and runs can be repeated"
                     )
+
+    def _first_observations(self, seed: int | None) -> dict[Any, list[Any]]:
+        given, _ = reset(self.env, seed, None)
+        playing = self._playing(frozenset())
+        return {agent: list(read_leaves(self._leaves[agent], given[agent])) for agent in playing if agent in given}
 
     def _called(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call the game; return None if it fails."""

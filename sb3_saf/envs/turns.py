@@ -65,8 +65,8 @@ class TurnsInParallel(BaseParallelWrapper[Any, Any, Any]):
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin a game (see PettingZoo)."""
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
             seed %= _SEEDS
+            self._rng = np.random.default_rng(seed)
         elif self._rng is not None:
             seed = int(self._rng.integers(_SEEDS))
         observations, infos = super().reset(seed, options)

@@ -18,7 +18,7 @@ from sb3_saf.buffers.rollout import TeamMinibatch
 from sb3_saf.networks.encoders import encoded
 from sb3_saf.networks.row_encoder import EncodedRows, EncodedTeams, RowEncoder
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.conversion import CLASSIC, Given, RowForm, given_by_game, pixels_to_codes
+from sb3_saf.teams.conversion import CLASSIC, Given, RowForm, check_form_of_state, given_by_game, pixels_to_codes
 from sb3_saf.teams.rows import (
     ACTION_MASK_KEY,
     ACTIVE_KEY,
@@ -134,8 +134,7 @@ class TeamRowsPolicy(BasePolicy):
         given = self.given_by_game(observation, action_masks)
         if given is not None:
             return given.act(self._predict_rows, state, episode_start, deterministic)
-        if isinstance(state, Mapping):
-            raise ValueError("expected state in the form of observations, that of rows, got one by agent")
+        check_form_of_state(False, state, episode_start)
         if isinstance(observation, Mapping):  # critics' entries have shapes that depend on the size of the team
             unread = {TEAM_KEY, ACTIVE_KEY, STATE_KEY} | (set() if self.acts_by_index else {AGENT_KEY})
             observation = {key: value for key, value in observation.items() if key not in unread}

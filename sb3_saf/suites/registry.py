@@ -236,7 +236,7 @@ class TeamEnvironment:
         try:
             venv: VecEnv = self.suite.vec_env(self.task, n_envs, seed, **options, **params)
         except (TypeError, AssertionError) as error:  # most often an argument that it does not have
-            raise ValueError(f"{self.id} cannot be made with {dict(params)}: {error}") from error
+            raise ValueError(f"{self.id} cannot be made with {dict(params)}: {str(error) or repr(error)}") from error
         return venv
 
     def make_game(self, params: Mapping[str, Any], render_mode: str | None = None) -> Any:
@@ -273,8 +273,9 @@ class TeamEnvironment:
 def _make_registered(kind: str, name: str, **kwargs: Any) -> Any:
     try:
         game = pettingzoo.make(kind, name, **kwargs)
-    except FailedToImport as error:
-        raise ValueError(str(error)) from error
+    except (FailedToImport, ImportError) as error:
+        cause = f" ({error.__cause__})" if error.__cause__ else ""
+        raise ValueError(f"{name} cannot be made: {error}{cause}") from error
     return TurnsInParallel(game) if kind == "aec" else game
 
 

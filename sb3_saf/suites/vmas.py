@@ -35,7 +35,7 @@ def _games(task: str, n_envs: int, seed: int | None, **params: Any) -> Any:
 SUITE: Final = Suite(
     name="vmas",
     title="robots that carry, balance and navigate together, batched in torch",
-    requires=("vmas>=1.5,<2",),
+    requires=("vmas>=1.5.2,<2",),
     extra="vmas",
     page="https://vmas.readthedocs.io",
     list_tasks=_tasks,

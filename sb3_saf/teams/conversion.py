@@ -402,6 +402,15 @@ class RowForm(NamedTuple):
     keys: frozenset[str] = frozenset()
 
 
+def check_form_of_state(by_agent: bool, state: Any, episode_start: Any) -> None:
+    """Raise ValueError if what is by agent is not what observations are; starts of agents may be an array, too."""
+    is_other = state is not None and isinstance(state, Mapping) != by_agent
+    if is_other or (isinstance(episode_start, Mapping) and not by_agent):
+        raise ValueError(
+            "expected state and episode_start in the form of observations, all of them by agent or none, got only some"
+        )
+
+
 class Given(NamedTuple):
     """
     What a game gives some agents, as rows.
@@ -431,18 +440,27 @@ class Given(NamedTuple):
         return np.stack([np.asarray(own) for own in actions])
 
     def memory(self, state: Any, episode_start: Any = None) -> tuple[Any, Any]:
-        """Return the memory of rows, and which rows begin, (B,), from those by agent if the observations are."""
+        """
+        Return the memory of rows, and which rows begin, (B,), from those by agent if the observations are.
+
+        :raises ValueError: if they have another form than the observations, or do not tell of an observed agent
+        """
         agents = self.agents
-        if agents is not None and isinstance(episode_start, Mapping):
-            episode_start = [bool(episode_start.get(agent)) for agent in agents]
-        if state and isinstance(state, Mapping) != (agents is not None):
-            raise ValueError("expected state in the form of observations, both by agent or none, got only one of them")
-        if agents is None or not state:
-            return state or None, episode_start
+        check_form_of_state(agents is not None, state, episode_start)
+        if agents is None:
+            return state, episode_start
+        if isinstance(episode_start, Mapping):
+            if missing := [agent for agent in agents if agent not in episode_start]:
+                raise ValueError(f"expected episode_start of each observed agent, got none of {missing}")
+            episode_start = [bool(episode_start[agent]) for agent in agents]
+        if np.size(episode_start) not in (1, len(agents)):
+            raise ValueError(f"expected episode_start of {len(agents)} agents, got {np.size(episode_start)}")
+        if not state:
+            return None, episode_start
         blank = tuple(np.zeros_like(part) for part in next(iter(state.values())))
         memory = tuple(np.stack(part) for part in zip(*(state.get(agent, blank) for agent in agents), strict=True))
         starts = np.array([agent not in state for agent in agents])
-        return memory, starts if episode_start is None else starts | np.asarray(episode_start).astype(bool)
+        return memory, starts if episode_start is None else starts | np.reshape(episode_start, -1).astype(bool)
 
     def act(
         self, predict: Callable[..., tuple[Any, Any]], state: Any, episode_start: Any, deterministic: bool

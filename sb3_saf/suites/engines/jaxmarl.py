@@ -32,7 +32,6 @@ with contextlib.redirect_stdout(sys.stdout), contextlib.redirect_stderr(sys.stde
     from jaxmarl.environments.smax.smax_env import MAP_NAME_TO_SCENARIO
 
 from sb3_saf.suites.engines.batch import BatchStep, ResumableBatch, ResumableBatchVecEnv
-from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, STATE_KEY, Array, TeamSpaces
 
 #: What the tasks of Overcooked and SMAX set, by their names.
@@ -535,8 +534,8 @@ def vec_env(
     :raises ValueError: if the state, picture or reward is missing, the environment has no teams of named agents, or the
         task sets an argument
     """
-    if reward_shaping_steps is not None:
-        check_count("reward_shaping_steps", reward_shaping_steps)
+    if reward_shaping_steps is not None and not reward_shaping_steps >= 1:
+        raise ValueError(f"reward_shaping_steps must be at least 1, got {reward_shaping_steps}; None for never")
     if params.keys() & (fixed or {}).keys():
         raise ValueError(f"expected no {' or '.join(fixed or {})}, which the task's name sets; choose another task")
     given = sorted({**params, **(fixed or {})}.items())

@@ -20,12 +20,13 @@ with contextlib.redirect_stderr(io.StringIO()), warnings.catch_warnings():
     from vmas.simulator.environment import Environment
 
 from sb3_saf.suites.engines.batch import Batch, BatchStep, BatchVecEnv
-from sb3_saf.teams.checks import check_count
 from sb3_saf.teams.rows import ACTION_MASK_KEY, ACTIVE_KEY, OBS_KEY, Array, TeamSpaces
 
 _ONE_AGENT: Final = "simple"
 #: Text of VMAS's warning about unknown parameters of a scenario.
 _UNUSED: Final = "not used by the scenario"
+#: Options of ``vmas.make_env`` on which rows depend.
+_SET: Final = {"wrapper", "dict_spaces", "multidiscrete_actions", "clamp_actions", "terminated_truncated"}
 
 
 def scenarios() -> list[str]:
@@ -180,8 +181,10 @@ def vec_env(
     """
     if state:
         raise ValueError(f"vmas/{scenario} tells no state of the game; leave state=True out")
-    if max_steps is not None:
-        check_count("max_steps", max_steps)
+    if max_steps is not None and not max_steps >= 1:
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}; None for no limit")
+    if given := sorted(params.keys() & _SET):
+        raise ValueError(f"vmas/{scenario} has {', '.join(given)} as rows need it; leave it out")
     with warnings.catch_warnings(record=True) as said, _gpus_left_alone(device):
         warnings.simplefilter("always")
         env = vmas.make_env(
@@ -193,8 +196,6 @@ def vec_env(
             seed=0,
             clamp_actions=True,
             terminated_truncated=True,
-            dict_spaces=False,
-            multidiscrete_actions=False,
             **params,
         )
     for warning in said:
