@@ -189,6 +189,9 @@ def test_masks_are_passed_by_agent() -> None:
         assert model.predict(observations, action_masks=partly, deterministic=False)[0]["b"] == 2
         infos: Any = {agent: {} if mask is None else {"action_mask": mask} for agent, mask in partly.items()}
         assert model.predict((observations, infos), deterministic=False)[0]["b"] == 2
+        both = {"b": 1 - np.eye(3)[0]}  # with a mask in the info: all masks must allow an action
+        infos["b"] = {"action_mask": 1 - np.eye(3)[1]}
+        assert model.predict((observations, infos), action_masks=partly | both, deterministic=False)[0]["b"] == 2
     with pytest.raises(ValueError, match=r"expected a mask of each observed agent, .* got none of \['agent', 'c'"):
         model.predict(observations, action_masks={"b": np.eye(3)[2]})
 

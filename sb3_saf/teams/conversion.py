@@ -496,7 +496,8 @@ def given_by_game(
     Convert what a game gives to rows; see :meth:`sb3_saf.policies.rows.TeamRowsPolicy.predict`.
 
     :param observation: rows, or observations of the game
-    :param action_masks: masks in the form of the observation; None for those in observations and infos
+    :param action_masks: masks in the form of the observation, beside those in observations and infos: all must allow
+        an action
     :param agent: index of the agent whose observation it is, if that is known
     :return: None for rows
     :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
@@ -514,7 +515,7 @@ def given_by_game(
         kinds = None if conversions is None else [conversions[index] for index in indices]
         # Where the game has masks in observations, infos are not read, as in training.
         masks = [
-            mask_in(infos.get(name)) if kinds is None or kinds[number].mask_key is None else None
+            [mask_in(infos.get(name))] if kinds is None or kinds[number].mask_key is None else []
             for number, name in enumerate(agents)
         ]
         if isinstance(action_masks, Mapping):
@@ -522,7 +523,7 @@ def given_by_game(
                 raise ValueError(
                     f"expected a mask of each observed agent, None for all of its actions, got none of {missing}"
                 )
-            masks = [action_masks[name] for name in agents]
+            masks = [[*of_agent, action_masks[name]] for name, of_agent in zip(agents, masks, strict=True)]
         return _given(team, [observation[name] for name in agents], masks, kinds, known, agents, takes_masks)
     if conversions is None:
         return None
@@ -539,7 +540,7 @@ def given_by_game(
             f"the agent: {{{known_by[0]!r}: observation}}"
         )
     index = fitting if len(fitting) == 1 else None
-    return _given(team, [observation], [action_masks], [kind], index, None, takes_masks)
+    return _given(team, [observation], [[action_masks]], [kind], index, None, takes_masks)
 
 
 def _agents_in(team: RowForm, observation: object) -> list[Any] | None:
@@ -566,7 +567,7 @@ def _agents_in(team: RowForm, observation: object) -> list[Any] | None:
 def _given(
     team: RowForm,
     entries: list[Any],
-    masks: list[Any],
+    masks: list[list[Any]],
     conversions: Sequence[AgentConversion] | None,
     indices: list[int] | None,
     agents: list[Any] | None,
@@ -575,33 +576,36 @@ def _given(
     """Convert observations and masks of some agents; without ``conversions`` they have the form of rows."""
     own: list[Array] = []
     legal: list[Any] = []
-    for number, (entry, mask) in enumerate(zip(entries, masks, strict=True)):
+    for number, (entry, of_agent) in enumerate(zip(entries, masks, strict=True)):
         try:
             if conversions is None:
                 has_mask = isinstance(entry, Mapping) and set(entry) == CLASSIC
                 own.append(np.asarray(entry["observation"] if has_mask else entry))
-                legal.append(entry[ACTION_MASK] if has_mask and mask is None else mask)
-                continue
-            conversion = conversions[number]
-            observation, mask_of_entry = conversion.split(entry)
-            own.append(conversion.own(observation))
-            if mask_of_entry is not None and conversion.mask_key is None and not takes_masks:
-                raise ValueError(f"expected no {ACTION_MASK!r}, because this policy was trained without masks")
-            legal.append(mask_of_entry if mask is None else mask)
-            if team.has_masks or (takes_masks and legal[-1] is not None):
-                legal[-1] = conversion.mask(legal[-1])
+                of_agent = [*of_agent, entry[ACTION_MASK] if has_mask else None]
+                given = [np.asarray(mask) for mask in of_agent if mask is not None]
+            else:
+                conversion = conversions[number]
+                observation, mask_of_entry = conversion.split(entry)
+                own.append(conversion.own(observation))
+                if mask_of_entry is not None and conversion.mask_key is None and not takes_masks:
+                    raise ValueError(f"expected no {ACTION_MASK!r}, because this policy was trained without masks")
+                given = [
+                    conversion.mask(mask) for mask in (*of_agent, mask_of_entry) if takes_masks and mask is not None
+                ]
+                if team.has_masks and not given:
+                    given = [conversion.mask(None)]
+            legal.append(np.minimum.reduce(given) if given else None)
         except ValueError as error:
             raise ValueError(f"observation of {'the agent' if agents is None else agents[number]}: {error}") from None
     if len(shapes := {array.shape for array in own}) > 1:
         raise ValueError(f"expected observations of one shape, that of rows, {team.own_shape}, got {sorted(shapes)}")
     rows = {OBS: np.stack(own)} | ({} if indices is None else {AGENT: np.array(indices)})
     action_masks = None
-    given = [np.asarray(mask) for mask in legal if mask is not None]
-    if takes_masks and given:
+    if takes_masks and (first := next((mask for mask in legal if mask is not None), None)) is not None:
         for number, mask in enumerate(legal):
             if mask is None:  # the agent has all of its actions
-                legal[number] = np.ones_like(given[0]) if conversions is None else conversions[number].mask(None)
-        action_masks = np.stack([np.asarray(mask) for mask in legal])
+                legal[number] = np.ones_like(first) if conversions is None else conversions[number].mask(None)
+        action_masks = np.stack(legal)
     if action_masks is not None and team.has_masks:
         rows, action_masks = {**rows, ACTION_MASK: action_masks}, None
     return Given(rows, action_masks, conversions, agents)
