@@ -33,6 +33,7 @@ from sb3_saf.training.replay import write_page
 from sb3_saf.training.run import GameStepsProgressBar, ProgressLines, RunOptions
 from sb3_saf.training.run import train as train_settings
 from sb3_saf.training.settings import Settings, load_settings
+from tests.toy_envs import CounterEnv
 from tests.weights import weights_of
 
 ENV = "TeamTogether-v0"
@@ -198,7 +199,9 @@ def test_a_line_for_every_tenth(capsys: pytest.CaptureFixture[str]) -> None:
 COUNTER = "tests.toy_envs:CounterEnv"
 
 
-def test_any_environment_is_trained_watched_drawn_and_tuned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_any_environment_is_trained_watched_drawn_and_tuned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In a folder whose name is a glob pattern, twice, because the second run must find the first."""
     logs = str(tmp_path / "runs [a]")
     short = ("--env", COUNTER, "--size", "smoke", "-n", "80", "-f", logs, "--eval-episodes", "2")
@@ -210,6 +213,7 @@ def test_any_environment_is_trained_watched_drawn_and_tuned(tmp_path: Path, caps
     with np.load(run / "evaluations.npz") as arrays:
         assert set(arrays["ep_lengths"].ravel()) == {5}
     gif = tmp_path / "game.gif"
+    monkeypatch.setitem(CounterEnv.metadata, "render_fps", None)
     result = zoo_enjoy.enjoy(["--env", COUNTER, "-f", logs, "--episodes", "2", "--gif", str(gif)])
     assert set(result.lengths) == {5} and gif.is_file()
     zoo_plot.main(["-f", logs, "-o", str(tmp_path / "curves.svg"), "--env", COUNTER])
@@ -295,6 +299,7 @@ def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest
     both = ["--model", str(model), str(run / "best_model.zip")]
     assert "a model with normalize is shown alone" in failed(both, capsys, replay_main)
     assert words in failed(both[:2], capsys, replay_main)
+    assert "is a folder without weights.safetensors" in failed(["--model", str(run)], capsys, replay_main)
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,10 @@ def test_gif_mp4_and_text_show_every_step_of_the_first_game(
     enjoy(logs, "--mp4", str(tmp_path / "game.mp4"))
     assert imageio_ffmpeg.count_frames_and_secs(tmp_path / "game.mp4")[0] == 10
     capsys.readouterr()
+    (tmp_path / "folder.gif").mkdir()
+    with pytest.raises(IsADirectoryError):
+        enjoy(logs, "--gif", str(tmp_path / "folder.gif"))
+    assert "team return" in capsys.readouterr().out  # what was measured is not lost
     enjoy(logs, "--text", "--seed", "9", "--exp-id", "3")
     pages = capsys.readouterr().out.split("team return")[0]
     assert [step for step in range(12) if f"step {step} " in pages] == list(range(10))
@@ -140,6 +144,7 @@ def test_a_window_needs_a_display(
         (["-f", "nowhere"], "there is no folder nowhere/saf; train first"),
         (["--env", "TeamSupport-v0"], "there is no run of TeamSupport-v0"),
         (["--load-checkpoint", "41"], "has no rl_model_41_steps.zip"),
+        (["--team", "saf"], "unknown team 'saf'; there is"),
         (["--gif", "film.mp4"], "a file that ends with .gif"),
         (["--gif", "a.gif", "--text"], "not allowed with"),
     ],
@@ -335,9 +340,10 @@ def test_runs_of_games_that_are_not_registered_are_found_by_others_names(
     assert "cannot import 'nowhere'" in failed(words, capsys, zoo_plot.main)
 
 
-def test_a_figure_from_a_folder(logs: Path, tmp_path: Path) -> None:
+def test_a_figure_from_a_folder(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "new" / "figure.png"
-    zoo_plot.main(["-f", str(logs), "--algos", "saf", "mappo", "-o", str(output)])
+    zoo_plot.main(["-f", str(logs), "--algos", "saf", "mappo", "-o", str(output.with_suffix(""))])
+    assert capsys.readouterr().out.splitlines()[-1] == str(output)
     picture = imageio.imread(output)
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, picture.shape[-1]), axis=0)) > 50

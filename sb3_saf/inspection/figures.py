@@ -214,8 +214,9 @@ def gif(pictures: Sequence[Picture], seconds: float = 0.125) -> bytes:
     sample = np.concatenate([np.asarray(frame) for frame in frames[:: 1 + len(frames) // _SAMPLED]])
     palette = Image.fromarray(sample).quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration = 10 * max(2, round(100 * seconds))  # whole hundredths, and browsers slow down what is shown for one
     file = io.BytesIO()
-    indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=round(1000 * seconds), loop=0)
+    indexed[0].save(file, "GIF", save_all=True, append_images=indexed[1:], duration=duration, loop=0)
     return file.getvalue()
 
 

@@ -105,14 +105,15 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
             with open_screen(options, games) as show:
                 env = games if show is None else Film(games, show)
                 result = evaluate_team(policy, env, options.episodes, deterministic=options.deterministic)
-        print(f"{trained.algo} on {trained.env_id}, weights of {path}")
-        print(f"team return {result}")
-        saved = SAVED_MODEL.fullmatch(path.name)
-        if saved or options.team is not None or (run.folder / FINISHED).exists():
-            game_steps = int(saved[1]) if saved else trained.game_steps
-            known = settings.standing(result.scores, game_steps)
-            if known is not None:
-                print(known.text)
+                # Before a recording is written, which may fail.
+                print(f"{trained.algo} on {trained.env_id}, weights of {path}")
+                print(f"team return {result}")
+                saved = SAVED_MODEL.fullmatch(path.name)
+                if saved or options.team is not None or (run.folder / FINISHED).exists():
+                    game_steps = int(saved[1]) if saved else trained.game_steps
+                    known = settings.standing(result.scores, game_steps)
+                    if known is not None:
+                        print(known.text)
     return result
 
 
@@ -163,7 +164,7 @@ class Film(TeamVecEnvWrapper):
 def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | None]:
     """Yield the function that shows pictures or text as the options say; None for nothing."""
     metadata = games.get_attr("metadata", [0])[0] if games.has_attr("metadata") else None
-    fps = int((metadata or {}).get("render_fps", FPS))
+    fps = (metadata or {}).get("render_fps") or FPS
     if options.no_render:
         yield None
     elif options.text:
@@ -190,7 +191,7 @@ def open_screen(options: argparse.Namespace, games: VecEnv) -> Iterator[Show | N
             window.close()
 
 
-def write_video(path: Path, pictures: Sequence[Picture], fps: int = FPS) -> None:
+def write_video(path: Path, pictures: Sequence[Picture], fps: float = FPS) -> None:
     """Write pictures, (height, width, 3) each, as GIF or MP4, by the path's ending."""
     if path.suffix.lower() == ".gif":
         path.write_bytes(gif(pictures, 1 / fps))

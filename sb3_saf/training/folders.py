@@ -420,7 +420,7 @@ def team_names(folder: str | Path | None = None) -> list[str]:
 def find_team(name: str, folder: str | Path | None = None) -> Run:
     """Return the run of a team whose files are as published; arguments and errors as those of :func:`load_team`."""
     env, _, method = name.rpartition("/")
-    known, name = team_names(folder), f"{folder_name(env)}/{method}"
+    known, name = team_names(folder), f"{folder_name(env)}/{method}" if env else method
     if name not in known:
         raise unknown_name("team", name, known)
     return published_run((TEAMS if folder is None else Path(folder)) / name)

@@ -57,10 +57,11 @@ def plot(arguments: Sequence[str] | None = None) -> None:
     require("pandas", "matplotlib")
     with user_errors():
         figure = _draw(options)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
+    path = options.output if options.output.suffix else options.output.with_suffix(".png")  # Matplotlib's ending
+    path.parent.mkdir(parents=True, exist_ok=True)
     with user_errors():  # for invalid file formats
-        figure.savefig(options.output)
-    print(options.output)
+        figure.savefig(path)
+    print(path)
 
 
 def _draw(options: argparse.Namespace) -> Figure:

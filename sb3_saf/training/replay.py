@@ -57,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
 def write_page(arguments: Sequence[str] | None = None) -> Path:
     """Write the page and return its path."""
     options = make_parser().parse_args(arguments)
-    with user_errors():
+    with user_errors(ValueError, RuntimeError, ImportError):
         seed = evaluation_seed(check_seed(options.seed))
         models = list(dict.fromkeys(options.model))
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
@@ -90,6 +90,10 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
     """Return the settings of a model's run, or those of the command line."""
     if not path.exists():
         raise CommandError(f"--model {path} is not there")
+    if path.is_dir():
+        raise CommandError(
+            f"--model {path} is a folder without {WEIGHTS}: name a model (.zip), or a published team's folder"
+        )
     if not (path.is_file() and (path.parent / RUN_FILE).is_file()):
         return load_settings(options.algo, options.env or "TeamSupport-v0", options.size, options.env_kwargs)
     run = published_run(path.parent) if path.name == WEIGHTS else Run(path.parent)
