@@ -87,6 +87,7 @@ TASKS: Final = (
     ),
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
     Task("lbf/Foraging-15x15-4p-3f-v3", 5_000_000),
+    Task("rware/rware-tiny-2ag-v2", 5_000_000),
     *(Task(f"overcooked/{layout}", 5_000_000, params=(f"{_SHAPING}2500000",)) for layout in KITCHENS),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     *(

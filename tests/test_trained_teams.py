@@ -22,6 +22,7 @@ from sb3_saf.training import folders as trained_teams
 from sb3_saf.training.commands import CommandError
 from sb3_saf.training.enjoy import enjoy
 from sb3_saf.training.folders import (
+    FINISHED,
     TEAMS,
     TEST_GAMES,
     WEIGHTS,
@@ -183,7 +184,7 @@ def test_the_command_checks_all_teams(teams: Path, capsys: pytest.CaptureFixture
     assert cli.main(["teams", str(teams)]) == 1
     printed = capsys.readouterr()
     assert printed.out.count(ALL_EQUAL) == len(METHODS) - 2
-    assert printed.err.count("has changed since the run was finished; restore it from the repository") == 2
+    assert printed.err.count("has changed since the run was finished; restore the team from the repository") == 2
 
 
 def test_a_team_of_a_suite_that_is_not_installed_is_no_failure(teams: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -246,10 +247,11 @@ def test_an_unknown_team_names_the_nearest(published: Path, env: str, method: st
         load_team(env, method, published)
 
 
-def test_a_team_without_weights_is_no_unknown_one(teams: Path) -> None:
-    (teams / LEVEL / "ippo" / WEIGHTS).unlink()
+@pytest.mark.parametrize(("file", "words"), [(WEIGHTS, "is missing"), (FINISHED, "cannot be read")])
+def test_a_team_that_lacks_a_file_is_no_unknown_one(teams: Path, file: str, words: str) -> None:
+    (teams / LEVEL / "ippo" / file).unlink()
     assert team_names(teams) == NAMES
-    with pytest.raises(ExportError, match=f"{WEIGHTS} is missing; restore it from the repository"):
+    with pytest.raises(ExportError, match=f"{file} {words}.*; restore the team from the repository"):
         load_team(LEVEL, "ippo", teams)
 
 

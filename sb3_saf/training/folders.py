@@ -387,7 +387,8 @@ def load_team(env: str, method: str, folder: str | Path | None = None, *, device
     Load a published team, without running code from its files.
 
     The model has as many games as in its training, none of which it was trained on; the first ones are those of its
-    row: ``evaluate_team(model, model.get_env(), 100)``, ``model.predict(own_observation)``.
+    row, but of VMAS, which draws all games at once: ``evaluate_team(model, model.get_env(), 100)``,
+    ``model.predict(own_observation)``.
 
     :param env: task and level, such as ``"TeamSupport-c2-h1"``, or ``"smax/2s3z"``
     :param method: such as ``"saf"``
@@ -429,8 +430,12 @@ def find_team(name: str, folder: str | Path | None = None) -> Run:
 def published_run(folder: Path) -> Run:
     """Return the run of a team's folder; ExportError if its files have changed, or name code to run."""
     run = Run(folder)
-    if damage := run.damage(WEIGHTS) or run.damage(RUN_FILE):
-        raise ExportError(f"{damage}; restore it from the repository: git checkout {folder}")
+    try:
+        damage = run.damage(WEIGHTS) or run.damage(RUN_FILE)
+    except ValueError as error:
+        damage = str(error)
+    if damage:
+        raise ExportError(f"{damage}; {_FIX}")
     check_runs_no_code(run.description["settings"], folder)
     return run
 
