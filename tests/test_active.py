@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,10 +24,12 @@ from sb3_saf import (
     SAFMaskablePolicy,
     SAFPolicy,
     TeamRolloutBuffer,
+    check_team_env,
     evaluate_team,
     make_team_env,
 )
 from sb3_saf.buffers.replay import TeamReplayBuffer
+from sb3_saf.checkpoints.states import environment_state
 from sb3_saf.envs.joint_observation import CentralizedValueWrapper
 from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.critic import ValueNormalizer
@@ -563,6 +566,10 @@ class TwiceMaskedEnv(TellingEnv):
     def action_masks(self) -> dict[str, Any]:
         return {agent: np.arange(N_ACTIONS) >= 2 for agent in self.agents}
 
+    def step(self, actions: dict[str, Any]) -> Any:
+        assert all(action >= 2 for action in actions.values()), actions
+        return super().step(actions)
+
 
 class ShownMasksEnv(TellingEnv):
     """Masks in observations or infos, without a method that returns them."""
@@ -574,6 +581,8 @@ class ShownMasksEnv(TellingEnv):
 
 def test_an_action_must_be_allowed_by_both_masks() -> None:
     env = telling_env(game=TwiceMaskedEnv, deaths={}, joins={})
+    check_team_env(partial(TwiceMaskedEnv, **{**LIVES, "deaths": {}, "joins": {}}))
+    assert environment_state(env), "in the trial of copies, too"
     model = make_model("SAFMaskablePolicy", env, MaskablePPO).learn(60)
     buffer = model.rollout_buffer
     taken = buffer.actions.reshape(-1).astype(int)

@@ -255,23 +255,23 @@ class Trial:
     def _legal_actions(
         self, observations: Mapping[Any, Any], infos: Mapping[Any, Any], playing: Sequence[Any]
     ) -> dict[Any, Any]:
-        masks: dict[Any, Any] = {}
+        method = masks_method(self.env)
+        told = None if method is None else method()
+        actions: dict[Any, Any] = {}
         for agent in playing:
             key, info = self.mask_keys[agent], infos.get(agent) or {}
-            masks[agent] = mask_in(info) if key is None else observations[agent][key]
-        if all(mask is None for mask in masks.values()):
-            method = masks_method(self.env)
-            shown = {} if method is None else method()
-            masks = {agent: shown.get(agent) if isinstance(shown, Mapping) else shown for agent in playing}
-        return {agent: legal_sample(self.actions[agent], mask) for agent, mask in masks.items()}
+            shown = mask_in(info) if key is None else observations[agent][key]
+            masks = map(np.asarray, (shown, told.get(agent) if isinstance(told, Mapping) else told))
+            fitting = [mask for mask in masks if mask.shape == (n_mask_entries(self.actions[agent]),)]
+            actions[agent] = legal_sample(self.actions[agent], np.logical_and.reduce(fitting) if fitting else None)
+        return actions
 
 
 def legal_sample(space: spaces.Space[Any], mask: Any) -> Any:
-    """Draw an action that a flat mask allows; any action if the mask is None or does not fit."""
-    flags = np.asarray(mask)
-    if flags.shape != (n_mask_entries(space),):
+    """Draw an action that a flat mask allows; any action if it is None."""
+    if mask is None:
         return space.sample()
-    flags = flags.astype(np.int8)
+    flags = np.asarray(mask).astype(np.int8)
     if isinstance(space, spaces.MultiDiscrete):
         return space.sample(mask=tuple(np.split(flags, np.cumsum(space.nvec)[:-1])))
     if isinstance(space, spaces.MultiBinary):

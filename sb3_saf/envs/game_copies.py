@@ -318,14 +318,16 @@ def _play(
     seen: list[bytes] = []
     deadline = time.monotonic() + seconds
     while len(seen) < n_steps and time.monotonic() < deadline:
-        rows, *outcome, _ = game.step(_actions(space, rows, game.num_envs))
+        rows, *outcome, _ = game.step(_actions(game, space, rows))
         seen.append(_bytes_of([rows, *outcome]))
     return rows, seen
 
 
-def _actions(space: spaces.Space[Any], rows: Any, n_rows: int) -> npt.NDArray[Any]:
-    masks = rows.get(ACTION_MASK_KEY) if isinstance(rows, Mapping) else None
-    return np.array([legal_sample(space, None if masks is None else masks[row]) for row in range(n_rows)], space.dtype)
+def _actions(game: TeamMarkovVectorEnv, space: spaces.Space[Any], rows: Any) -> npt.NDArray[Any]:
+    masks = rows.get(ACTION_MASK_KEY) if isinstance(rows, Mapping) else None, game.masks_of_method()
+    given = [one for one in masks if one is not None]
+    legal = np.logical_and.reduce(given) if given else [None] * game.num_envs
+    return np.array([legal_sample(space, mask) for mask in legal], space.dtype)
 
 
 def _bytes_of(data: Any) -> bytes:

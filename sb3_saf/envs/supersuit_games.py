@@ -30,7 +30,7 @@ from sb3_saf.envs.audit import check_is_parallel
 from sb3_saf.envs.game_copies import Way, find_way, is_found_by_name, packed, pickled, unpacked, unpickled
 from sb3_saf.envs.game_reader import AnyParallelEnv, GameReader
 from sb3_saf.envs.gymnasium_team import as_parallel
-from sb3_saf.teams.conversion import MASK_NAMES
+from sb3_saf.teams.conversion import MASK_NAMES, AgentConversion
 from sb3_saf.teams.rows import ACTIVE_KEY, TERMINAL_OBSERVATION, TRUNCATED
 
 Info: TypeAlias = "dict[str, Any]"
@@ -177,6 +177,12 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
             rows.append(info)
         return rows
 
+    def masks_of_method(self) -> list[Any] | None:
+        """Return the rows' masks of the game's method ``action_masks``; None if it has none."""
+        if not audit.has_masks_method(self.par_env):
+            return None
+        return masks_of_method(self.par_env, self.agents, tuple(self._reader.conversions.values()))
+
     def snapshot(self, way: Way) -> dict[str, Any]:
         """Return the complete state of the game, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
         if way == "pickle":
@@ -196,6 +202,17 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         self._ended = {agent for agent, ended in zip(self.agents, snapshot["ended"], strict=True) if ended}
         self._playing = self._find_playing()
         self.reset_infos = [{} for _ in self.agents]
+
+
+def masks_of_method(env: Any, agents: Sequence[Any], conversions: Sequence[AgentConversion]) -> list[Any]:
+    """Return the masks of a game's method ``action_masks``; any action of agents that it leaves out is legal."""
+    masks = audit.game_attribute(env, "action_masks")()
+    if not isinstance(masks, Mapping):
+        masks = dict.fromkeys(agents, masks)
+    return [
+        conversion.mask(masks.get(agent, np.ones(sum(conversion.action.choices)))).astype(bool)
+        for agent, conversion in zip(agents, conversions, strict=True)
+    ]
 
 
 def _copied(info: Mapping[str, Any], agent: Any) -> Info:

@@ -18,10 +18,9 @@ from sb3_saf.envs.audit import Trial, check_is_parallel
 from sb3_saf.envs.game_copies import check_signatures, common_settings, sign_games
 from sb3_saf.envs.game_reader import AskMasks, GameReader, MakeEnv
 from sb3_saf.envs.gymnasium_team import as_parallel
-from sb3_saf.envs.supersuit_games import TeamConcatVecEnv, game_factory
+from sb3_saf.envs.supersuit_games import TeamConcatVecEnv, game_factory, masks_of_method
 from sb3_saf.envs.supersuit_workers import WorkerGames
 from sb3_saf.teams.checks import check_count
-from sb3_saf.teams.conversion import AgentConversion
 from sb3_saf.teams.vec_env import TeamVecEnv, chosen_indices
 
 #: Episodes of each game after which games that began alike are taken to ignore their seeds.
@@ -240,7 +239,7 @@ class SuperSuitVecEnv(TeamVecEnv):
         """Call a method of the rows' games, once for every row; ``action_masks`` once per game (see the class)."""
         rows = chosen_indices(indices, self.num_envs)
         if method_name == "action_masks" and not method_args and not method_kwargs:
-            masks = self._ask(self._games_of(rows), _action_masks, self.possible_agents, self.conversions)
+            masks = self._ask(self._games_of(rows), masks_of_method, self.possible_agents, self.conversions)
             return [mask[row % self.n_agents] for row, mask in zip(rows, masks, strict=True)]
         call = (_call_method, method_name, method_args, method_kwargs)
         return [self._ask([game], *call)[0] for game in self._games_of(rows)]
@@ -282,17 +281,6 @@ def _call_method(env: Any, name: str, args: Sequence[Any], kwargs: Mapping[str, 
 
 def _is_wrapped(env: Any, wrapper_class: type[Any]) -> bool:
     return any(isinstance(layer, wrapper_class) for layer in audit.layers_of(env))
-
-
-def _action_masks(env: Any, agents: Sequence[Any], conversions: Sequence[AgentConversion]) -> list[Any]:
-    """Return the masks of a game's method ``action_masks``; any action of agents that it leaves out is legal."""
-    masks = audit.game_attribute(env, "action_masks")()
-    if not isinstance(masks, Mapping):
-        masks = dict.fromkeys(agents, masks)
-    return [
-        conversion.mask(masks.get(agent, np.ones(sum(conversion.action.choices)))).astype(bool)
-        for agent, conversion in zip(agents, conversions, strict=True)
-    ]
 
 
 def _joined(parts: Sequence[Any]) -> Any:

@@ -192,4 +192,6 @@ def load_normalization(env: VecEnv, model: Path) -> None:
         with np.load(path, allow_pickle=False) as arrays:
             load_normalization_statistics(layer, dict(arrays))
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"cannot read the statistics of normalize in {path}: {error}") from error
+        raise ValueError(
+            f"cannot read the statistics of normalize in {path}: {error}; if {model} was trained without, leave it out"
+        ) from error
