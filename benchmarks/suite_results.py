@@ -65,6 +65,11 @@ class Task(NamedTuple):
         return self.folder or self.env_id.replace("/", "-")
 
     @property
+    def trainings(self) -> str:
+        """Return the folder of its trainings, all of which have the same settings."""
+        return "-".join([self.name, *self.methods])
+
+    @property
     def game(self) -> str:
         """Return the environment with the parameters of every game."""
         return " ".join([self.env_id, *(param for param in self.params if not param.startswith(_SHAPING))])
@@ -88,11 +93,18 @@ TASKS: Final = (
     Task("lbf/Foraging-10x10-3p-3f-v3", 5_000_000),
     Task("lbf/Foraging-15x15-4p-3f-v3", 5_000_000),
     Task("rware/rware-tiny-2ag-v2", 5_000_000),
-    *(Task(f"overcooked/{layout}", 5_000_000, params=(f"{_SHAPING}2500000",)) for layout in KITCHENS),
+    *(
+        Task(f"overcooked/{layout}", 5_000_000, (*METHODS, "pqn"), params=(f"{_SHAPING}2500000",))
+        for layout in KITCHENS
+    ),
     # Returns of whole battles: in long trainings of 3m they win more than short rollouts (results/suites.md).
     *(
-        Task(f"smax/{battle}", 10_000_000, settings=("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0"))
+        Task(f"smax/{battle}", 10_000_000, methods, settings=settings)
         for battle in ("2s3z", "3s5z", "3s_vs_5z", "5m_vs_6m", "smacv2_5_units")
+        for methods, settings in (
+            (METHODS, ("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0")),
+            (("pqn",), ("n_envs:256",)),
+        )
     ),
 )
 
@@ -100,7 +112,7 @@ TASKS: Final = (
 def run(task: Task, seed: int, options: argparse.Namespace) -> None:
     """Train and test the missing cells of a task and seed, one after the other."""
     words = ["run", task.name, "--env", task.env_id, "--size", "small", "--workers", "1", "--seeds", str(seed)]
-    words += ["-n", str(task.game_steps), "--methods", *task.methods, "-f", str(options.folder / task.name)]
+    words += ["-n", str(task.game_steps), "--methods", *task.methods, "-f", str(options.folder / task.trainings)]
     words += ["-params", *task.settings] if task.settings else []
     experiments([*words, "--env-kwargs", *task.params] if task.params else words)
 
@@ -205,8 +217,8 @@ def main() -> None:
         for task in chosen:
             run(task, seed, options)
     for task in chosen:
-        if (options.folder / task.name).is_dir():
-            add(task.name, options.folder / task.name / task.name, RAW)
+        if (options.folder / task.trainings).is_dir():
+            add(task.name, options.folder / task.trainings / task.name, RAW)
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(fill(text, {"table": "\n".join(table(TASKS, RAW))}), encoding="utf-8")
     figure(TASKS, RAW).savefig(RAW / "curves.png", dpi=80)
