@@ -181,6 +181,7 @@ def test_masks_are_passed_by_agent() -> None:
         masks = dict.fromkeys(observations, np.eye(3)[action])
         assert model.predict(observations, action_masks=masks)[0] == dict.fromkeys(observations, action)
         assert model.predict(observations["b"], action_masks=masks["b"])[0] == action
+        assert model.predict(observations, action_masks=masks["b"])[0] == dict.fromkeys(observations, action)
     seen = spaces.Box(0, 1, (1,))
     conversion = AgentConversion.of(seen, spaces.Discrete(2), seen, spaces.Discrete(3))
     assert conversion.mask([0, 1, 1]).tolist() == [0, 1, 0], "a mask of rows allows no action that the agent lacks"

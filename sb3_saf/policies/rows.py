@@ -126,8 +126,9 @@ class TeamRowsPolicy(BasePolicy):
             step before, ``{agent: state}``. None where episodes begin; agents that it lacks begin
         :param episode_start: as in SB3, of observations by agent also ``{agent: bool}``
         :param deterministic: as in SB3
-        :param action_masks: of policies with masks in the form of the observation, with None for an agent that may do
-            everything; of MaskablePPO's also for rows
+        :param action_masks: of policies with masks in the form of the observation, or one for all agents, with None for
+            an agent that may do everything; of MaskablePPO's also for rows. An action must be allowed by those in
+            observations and infos, too
         :return: actions and the next state; ``{agent: action}`` for observations by agent
         :raises ValueError: for masks that the policy cannot take, and for states and starts of other rows
         """

@@ -496,8 +496,8 @@ def given_by_game(
     Convert what a game gives to rows; see :meth:`sb3_saf.policies.rows.TeamRowsPolicy.predict`.
 
     :param observation: rows, or observations of the game
-    :param action_masks: masks in the form of the observation, beside those in observations and infos: all must allow
-        an action
+    :param action_masks: masks in the form of the observation, or one for all agents, beside those in observations and
+        infos: all must allow an action
     :param agent: index of the agent whose observation it is, if that is known
     :return: None for rows
     :raises ValueError: for unknown agents, and observations and masks that are not of the game's form
@@ -518,7 +518,9 @@ def given_by_game(
             [mask_in(infos.get(name))] if kinds is None or kinds[number].mask_key is None else []
             for number, name in enumerate(agents)
         ]
-        if isinstance(action_masks, Mapping):
+        if action_masks is not None:
+            if not isinstance(action_masks, Mapping):
+                action_masks = dict.fromkeys(agents, action_masks)
             if missing := [name for name in agents if name not in action_masks]:
                 raise ValueError(
                     f"expected a mask of each observed agent, None for all of its actions, got none of {missing}"
