@@ -1,14 +1,16 @@
 """
-Ask why a team loses battles of SMAX: ``python -m benchmarks.battles RUN``.
+Ask why a team wins or loses battles of SMAX: ``python -m benchmarks.battles RUN``.
 
-Plays a trained team many times from the same starts, and lets a planner act in its place before the first hit, after
-it, or always. The planner draws joint actions of the team, plays each to the end in copies of the battle with other
-random streams and the team's most likely actions, and takes the best.
+Plays a trained team many times from the same starts, counts who can shoot when the first unit is hit, and lets a
+planner act in the team's place before the first hit, after it, or always. The planner draws joint actions of the team,
+plays each to the end in copies of the battle with other random streams and the team's most likely actions, and takes
+the best.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -22,7 +24,7 @@ from sb3_saf.experiments.results import BEST_MODEL
 from sb3_saf.suites.engines.jaxmarl import SCENARIOS, JaxPrograms, rules_of
 from sb3_saf.teams.rows import Array
 from sb3_saf.training.enjoy import make_policy
-from sb3_saf.training.folders import Run
+from sb3_saf.training.folders import WEIGHTS, Run
 
 _NAME: Final = "HeuristicEnemySMAX"
 #: What the planner may do: moments at which it acts, by whether any unit has been hit.
@@ -45,13 +47,14 @@ class Battles:
     """
     Battles of a trained team.
 
-    :param folder: its run, of ``sb3_saf.train``
+    :param folder: its run, of ``sb3_saf.train``, or a folder of ``trained_teams``
     """
 
     def __init__(self, folder: Path, seed: int) -> None:
         run = Run(folder)
+        weights = next(path for name in (BEST_MODEL, WEIGHTS) if (path := folder / name).exists())
         with closing(run.settings.make_env(run.seed, evaluation=True, n_envs=1)) as games:
-            self._policy = make_policy(run.settings, folder / BEST_MODEL, games)
+            self._policy = make_policy(run.settings, weights, games)
         env = jaxmarl.make(_NAME, scenario=SCENARIOS[run.settings.environment.task])
         self._programs = JaxPrograms(env, rules_of(_NAME))
         self._random = np.random.default_rng(seed)
@@ -74,8 +77,16 @@ class Battles:
 
     def is_hit(self, position: Position) -> npt.NDArray[np.bool_]:
         """Return where any unit has lost health, (E,)."""
-        battle = self._programs.packing.unpack([np.asarray(one) for one in position.buffers]).state.state
+        battle = self._battle(position)
         return (battle.unit_health < self._programs.env.unit_type_health[battle.unit_types]).any(axis=1)
+
+    def in_reach(self, position: Position) -> npt.NDArray[np.int64]:
+        """Return how many units of the team, and of the enemy, have an opponent in reach of their weapons, (E, 2)."""
+        battle, n = self._battle(position), len(self._programs.agents)
+        distances = np.linalg.norm(battle.unit_positions[:, :, None] - battle.unit_positions[:, None], axis=3)
+        reach = np.asarray(self._programs.env.unit_type_attack_ranges)[battle.unit_types]
+        shots = (distances < reach[:, :, None]) & battle.unit_alive[:, :, None] & battle.unit_alive[:, None]
+        return np.stack([shots[:, :n, n:].any(axis=2).sum(axis=1), shots[:, n:, :n].any(axis=2).sum(axis=1)], axis=1)
 
     def plan(self, position: Position, n_candidates: int, n_futures: int) -> Array:
         """Return the best of n candidates, the most likely actions and drawn ones, (E, N)."""
@@ -93,6 +104,7 @@ class Battles:
         first: Array | None = None,
         planned: tuple[bool, ...] = (),
         planner: tuple[int, int] = (12, 8),
+        watch: Callable[[Position], None] = lambda position: None,
     ) -> npt.NDArray[np.bool_]:
         """
         Play battles to the end.
@@ -100,6 +112,7 @@ class Battles:
         :param first: (E, N) first actions in the place of the team's
         :param planned: whether a unit has been hit when the planner acts, see ``PLANNED``
         :param planner: candidates and futures of each
+        :param watch: called with the position after each step
         :return: (E,) won
         """
         n = len(position.buffers[0])
@@ -115,7 +128,21 @@ class Battles:
             ended, _, victory = (np.asarray(results)[:, actions.shape[1] :] != 0).T
             won |= victory & ~is_over
             is_over |= ended
+            watch(position)
         return won
+
+    def first_contact(self, starts: Position) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
+        """Return which battles are won, (E,), and ``in_reach`` after the first hit of each, (E, 2), NaN without one."""
+        counts = np.full((len(starts.buffers[0]), 2), np.nan)
+
+        def watch(position: Position) -> None:
+            new = self.is_hit(position) & np.isnan(counts[:, 0])
+            counts[new] = self.in_reach(position)[new]
+
+        return self.play(starts, deterministic=False, watch=watch), counts
+
+    def _battle(self, position: Position) -> Any:
+        return self._programs.packing.unpack([np.asarray(one) for one in position.buffers]).state.state
 
     def _keys(self, n: int) -> npt.NDArray[np.uint32]:
         return self._random.integers(0, 2**32, (n, 2), dtype=np.uint32)
@@ -135,6 +162,9 @@ def main() -> None:
         chances, share = won.reshape(options.n, -1).mean(axis=1), won.mean()
         by_chance = share * (1 - share) / options.repeats
         print(f"{name} actions: {share:.1%} won; variance over starts {chances.var():.4f}, by chance {by_chance:.4f}")
+    won, counts = battles.first_contact(starts)
+    own, enemy = np.nanmean(counts, axis=0)
+    print(f"{won.mean():.1%} won; at the first hit {own:.1f} units and {enemy:.1f} enemies have an opponent in reach")
     for name, planned in PLANNED.items():
         print(f"planner {name}: {battles.play(starts, planned=planned).mean():.1%} won")
 
