@@ -295,6 +295,11 @@ def test_files_that_name_code_are_refused(teams: Path, settings: dict[str, str])
         load_team(LEVEL, "ippo", teams)
 
 
+def test_callbacks_of_training_are_not_made_by_loading(teams: Path) -> None:
+    change(teams, lambda saved: saved.update(callback="no_such_module.Callback"))
+    assert load_team(LEVEL, "ippo", teams).get_env() is not None
+
+
 # --- those of the repository ------------------------------------------------------------------------------------------
 
 OWN = team_names() if TEAMS.is_dir() else []

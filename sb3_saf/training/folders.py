@@ -378,8 +378,8 @@ _CONFIDENCE: Final = 0.999
 #: On another kind of processor networks are rounded otherwise, and an action is drawn otherwise in one game of many.
 EQUAL_GAMES: Final = 0.9
 _FIX: Final = "restore the team from the repository, or publish it again if a change of the code is meant to change it"
-#: Settings that import by name.
-_CODE: Final = ("env_wrapper", "vec_env_wrapper", "callback")
+#: Settings that import by name when games are made; callbacks, which only training makes, are not among them.
+_CODE: Final = ("env_wrapper", "vec_env_wrapper")
 
 
 def load_team(env: str, method: str, folder: str | Path | None = None, *, device: str = "auto") -> BaseAlgorithm:
