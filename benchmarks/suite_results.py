@@ -36,6 +36,7 @@ RAW: Final = Path("results", "field")
 
 #: Game steps of trainings whose curves are drawn.
 _LONG: Final = 1_000_000
+_MEMORY: Final = "-gru"
 #: Shapes the rewards of training only.
 _SHAPING: Final = "reward_shaping_steps:"
 
@@ -102,7 +103,7 @@ TASKS: Final = (
         Task(f"smax/{battle}", 10_000_000, methods, settings=settings)
         for battle in ("2s3z", "3s5z", "3s_vs_5z", "5m_vs_6m", "smacv2_5_units")
         for methods, settings in (
-            (METHODS, ("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0")),
+            ((*METHODS, f"saf{_MEMORY}"), ("n_envs:256", "n_minibatches:8", "n_steps:32", "gae_lambda:1.0")),
             (("pqn",), ("n_envs:256",)),
         )
     ),
@@ -136,7 +137,8 @@ def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str, floa
 
 
 def _in_short(method: str) -> str:
-    return NAMED[method].words.partition(",")[0]
+    words = NAMED[method.removesuffix(_MEMORY)].words.partition(",")[0]
+    return f"{words}, GRU" if method.endswith(_MEMORY) else words
 
 
 def _over_seeds(values: pd.Series) -> str:
@@ -168,10 +170,11 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
         random = tests[tests["method"] == RANDOM]["return_mean"].mean()
         for method in task.methods:
             here = tests[tests["method"] == method]
+            cells = [f"`{task.game}`", f"{task.game_steps:,}", _in_short(method)]
             if here.empty:
+                yield f"| {' | '.join([*cells, 'not trained', '; '.join(others), '', f'{random:.2f}', '0', ''])} |"
                 continue
             won = "" if here["success_rate"].isna().any() else f", {here['success_rate'].mean():.0%} won"
-            cells = [f"`{task.game}`", f"{here['game_steps'].max():,}", _in_short(method)]
             cells += [
                 f"**{_over_seeds(here['return_mean'])}**{won}",
                 "; ".join(others),
@@ -200,7 +203,7 @@ def figure(tasks: Iterable[Task], folder: Path) -> Figure:
             lines["random team"][task.game] = random["return_mean"].mean()
             if scores := [score for _, _, score in beside(task, baselines) if score is not None]:
                 lines["others, best"][task.game], lines["others, lowest"][task.game] = max(scores), min(scores)
-    names = {name: _in_short(name) for name in NAMED}
+    names = {name: _in_short(name) for name in (*NAMED, f"saf{_MEMORY}")}
     return draw_curves(pd.concat(runs.values()), None, "task", "return", names, lines)
 
 

@@ -698,10 +698,15 @@ def test_statistics_of_observations_leave_out_the_dead() -> None:
 
 def test_a_model_without_its_games_tells_that_they_were_normalised(tmp_path: Path) -> None:
     plain = make_team_env(Alone, 2)
-    normal = CentralizedValueWrapper(VecNormalize(plain.venv, norm_obs_keys=["obs"], norm_reward=False, training=False))
+    statistics = VecNormalize(plain.venv, norm_obs_keys=["obs"], norm_reward=False)
+    normal = CentralizedValueWrapper(statistics)
     model = ppo(normal)
     model.save(tmp_path / "model")
     loaded = PPO.load(tmp_path / "model")
+    with pytest.raises(ValueError, match="without statistics"):
+        evaluate_team(loaded, normal, 2)
+    normal.reset()
+    statistics.training = False
     assert len(evaluate_team(loaded, normal, 2).returns) == 2
     for play in (lambda: evaluate_team(loaded, plain, 2), lambda: inspect_team(model, plain, 2)):
         with pytest.raises(ValueError, match="expected observations normalised by VecNormalize, as in the training of"):

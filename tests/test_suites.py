@@ -433,7 +433,10 @@ def test_an_unknown_name_lists_the_nearest(name: str, nearest: str) -> None:
     ("name", "words"),
     [
         ("nowhere.game", "cannot import 'nowhere.game' .* set PYTHONPATH"),
-        ("tests.toy_envs:CounterEnw", "expected a function or class, got tests.toy_envs.CounterEnw = None$"),
+        (
+            "tests.toy_envs:CounterEnw",
+            "expected a function or class, got tests.toy_envs.CounterEnw = None .did you mean 'CounterEnv'",
+        ),
         ("tests.test_other_games:Nim", "got a function that returned the AECEnv .*; convert it with"),
         ("tests.toy_envs", "parallel_env = None; where agents take turns, name a function .*TurnsInParallel"),
     ],

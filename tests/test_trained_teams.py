@@ -156,6 +156,9 @@ def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypat
     with pytest.raises(CommandError, match="play one game, but coordination was 2, now 1; choose a level with --env-k"):
         write_page(both)
     assert write_page([*both, "--env-kwargs", "coordination:2"]).is_file()
+    change(tmp_path / "teams", lambda saved: saved.update(frame_stack=2), f"{LEVEL}/saf")
+    with pytest.raises(CommandError, match=r"frame_stack was None, now 2; .* models of equal wrappers"):
+        write_page([*both, "--env-kwargs", "coordination:2"])
 
 
 def test_a_page_runs_no_code_of_a_team(teams: Path, tmp_path: Path) -> None:

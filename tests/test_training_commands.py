@@ -252,14 +252,15 @@ def test_wrappers_of_rl_zoo3(tmp_path: Path) -> None:
 default: {n_envs: 2, n_steps: 10, n_minibatches: 1, rollout_buffer_class: TeamRolloutBuffer}
 "tests.toy_envs:CounterEnv":
   env_wrapper: [{supersuit.dtype_v0: {dtype: float64}}]
-  vec_env_wrapper: tests.team_venv.DoublingWrapper
+  vec_env_wrapper: [tests.team_venv.DoublingWrapper, stable_baselines3.common.vec_env.VecCheckNan]
   frame_stack: 2
   normalize: true
   callback: [{stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes: {max_episodes: 2}}]
 """)
     given = f"-conf {tmp_path}/own.yml --env {COUNTER} --seed 0 --size smoke -f {tmp_path} --eval-freq -1 -n 400"
-    with pytest.warns(UserWarning, match="DoublingWrapper cannot give the state of its games"):
+    with pytest.warns(UserWarning, match="DoublingWrapper cannot give the state of its games") as told:
         zoo_train.main(given.split())
+    assert not any("VecCheckNan" in str(one.message) for one in told)
     run = tmp_path / "saf" / "tests.toy_envs-CounterEnv_1"
     model = PPO.load(run / "tests.toy_envs-CounterEnv.zip")
     assert isinstance(model.observation_space, spaces.Dict)
@@ -311,6 +312,8 @@ def test_every_saved_model_has_its_own_statistics(tmp_path: Path, capsys: pytest
         ("vec_env_wrapper:stable_baselines3.common.vec_env.VecFrameStack", "vec_env_wrapper: .*'n_stack'"),
         ("vec_env_wrapper:stable_baselines3.common.vec_env.VecNormalize", "vec_env_wrapper cannot be .* use normalize"),
         ("env_wrapper:nowhere.Wrapper", "cannot import 'nowhere'"),
+        ("env_wrapper:supersuit.frame_stak_v1", "frame_stak_v1 = None .did you mean 'frame_stack_v"),
+        ("env_wrapper:string.capwords", "env_wrapper: .*has no attribute 'split'"),
         ("frame_stack:0", "frame_stack=0"),
         ("ent_coef:0.0 callback:sb3_saf.EntropySchedule", "EntropySchedule has nothing to change"),
     ],

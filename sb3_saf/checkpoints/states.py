@@ -38,7 +38,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat, con
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.utils import get_latest_run_id
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
+from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, VecNormalize, VecTransposeImage
 
 from sb3_saf.buffers.replay import TeamReplayBuffer
 from sb3_saf.callbacks import TeamEvalCallback, game_steps
@@ -53,7 +53,7 @@ from sb3_saf.teams.rows import OBS_KEY
 from sb3_saf.teams.vec_env import TeamVecEnv, game_seeds_of, layers
 
 #: Wrappers that remember nothing from step to step.
-_WITHOUT_STATE: Final = (VecTransposeImage, SharedReward)
+_WITHOUT_STATE: Final = (VecTransposeImage, VecCheckNan, SharedReward)
 _STATISTICS: Final = ("mean", "var", "count")
 #: Counters of callbacks, the only attributes that a checkpoint sets.
 _COUNTERS: Final[dict[Any, tuple[str, ...]]] = {

@@ -44,9 +44,12 @@ def evaluation_seed(seed: int, test: int | None = None) -> int:
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ValueError:
     """Return an error for an unknown name of a kind, such as ``"algorithm"``."""
     names = list(known)
-    nearest = get_close_matches(str(name), names, n=1)
-    did_you_mean = f" (did you mean {nearest[0]!r}?)" if nearest else ""
-    return ValueError(f"unknown {kind} {name!r}{did_you_mean}; there is {', '.join(names)}")
+    return ValueError(f"unknown {kind} {name!r}{_did_you_mean(name, names)}; there is {', '.join(names)}")
+
+
+def _did_you_mean(name: object, known: Iterable[str]) -> str:
+    nearest = get_close_matches(str(name), list(known), n=1)
+    return f" (did you mean {nearest[0]!r}?)" if nearest else ""
 
 
 def check_count(name: str, value: object) -> int:
@@ -81,14 +84,19 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
 def import_by_name(module: str, name: str, what: str, hint: str = "") -> Any:
     """Import a callable from a module; the ValueError contains ``what``, and ``hint`` if the module lacks it."""
     try:
-        value = getattr(importlib.import_module(module), name, None)
+        imported = importlib.import_module(module)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{what}: cannot import {module!r} ({error}); install the package, or set PYTHONPATH to the folder that "
             "has it"
         ) from error
+    try:
+        value = getattr(imported, name, None)
+    except ImportError:  # SuperSuit's of a wrapper that it does not have
+        value = None
     if not callable(value):
-        raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}{hint}")
+        got = f"{module}.{name} = {value!r}{hint or _did_you_mean(name, vars(imported))}"
+        raise ValueError(f"{what}: expected a function or class, got {got}")
     return value
 
 

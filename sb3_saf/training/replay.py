@@ -63,9 +63,16 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
         settings = [_settings_of(path, options) for path in paths]
         suite = settings[0].environment.suite
-        levels = [{"env": own.env_id, **own.environment.of_evaluation(own.env_kwargs)} for own in settings]
+        levels = [
+            {"env": own.env_id, **own.environment.of_evaluation(own.env_kwargs)}
+            | {key: own.wrapping.get(key) for key in ("env_wrapper", "vec_env_wrapper", "frame_stack")}
+            for own in settings
+        ]
         if changed := next(filter(None, (differences(levels[0], level) for level in levels)), ""):
-            raise ValueError(f"models side by side play one game, but {changed}; choose a level with --env-kwargs")
+            raise ValueError(
+                f"models side by side play one game, but {changed}; choose a level with --env-kwargs, or models of "
+                "equal wrappers"
+            )
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
         with closing(
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)

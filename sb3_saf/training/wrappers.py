@@ -69,7 +69,7 @@ def _called(key: str, function: Callable[..., Any], arguments: Mapping[str, Any]
     """Call a function; its errors name the key of the settings."""
     try:
         return function(*given, **arguments)
-    except (TypeError, ValueError, AssertionError) as error:
+    except (TypeError, ValueError, AssertionError, AttributeError) as error:
         raise ValueError(f"{key}: {error}") from error
 
 
