@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -53,8 +52,7 @@ class Battles:
     def __init__(self, folder: Path, seed: int) -> None:
         run = Run(folder)
         weights = next(path for name in (BEST_MODEL, WEIGHTS) if (path := folder / name).exists())
-        with closing(run.settings.make_env(run.seed, evaluation=True, n_envs=1)) as games:
-            self._policy = make_policy(run.settings, weights, games)
+        self._policy = make_policy(run.settings, weights)
         env = jaxmarl.make(_NAME, scenario=SCENARIOS[run.settings.environment.task])
         self._programs = JaxPrograms(env, rules_of(_NAME))
         self._random = np.random.default_rng(seed)

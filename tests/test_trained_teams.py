@@ -134,6 +134,18 @@ def test_a_team_stays_until_the_next_one_can_be_made(
     assert check_team(NAMES[0], teams, batches=1)
 
 
+def test_a_damaged_cell_is_not_passed_over(experiments: Path, published: Path, tmp_path: Path) -> None:
+    curve = experiments / "cells" / find_team(NAMES[0], published).description["row"]["cell"] / "curve.csv"
+    content = curve.read_bytes()
+    try:
+        curve.write_bytes(content + b"\n")
+        with pytest.raises(ValueError, match=r"curve.csv has changed .* the same run command writes them anew"):
+            tables.publish(experiments, tmp_path)
+    finally:
+        curve.write_bytes(content)
+    assert not list(tmp_path.iterdir())
+
+
 def test_published_files_name_no_computer_and_are_small(published: Path) -> None:
     for name in NAMES:
         assert {path.name for path in (published / name).iterdir()} == {
@@ -147,7 +159,17 @@ def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(trained_teams, "TEAMS", published)
     assert len(enjoy(["--team", f"{LEVEL}/saf-gru", "--no-render", "--episodes", "2"]).returns) == 2
     assert len(enjoy(["--team", f"{LEVEL}/saf", "--no-render", "--env-kwargs", "n_agents:5"]).returns) == 32
+    refused = {
+        "leave --env out": ["--env", "KeyForTreasure-v0"],
+        "leave --algo out": ["--algo", "mappo"],
+        "expected games like those on which": ["--env-kwargs", "view_size:5"],
+    }
+    for words, given in refused.items():
+        with pytest.raises(CommandError, match=words):
+            enjoy(["--team", f"{LEVEL}/saf", "--no-render", *given])
     models = [str(published / LEVEL / "saf"), str(published / LEVEL / "saf-gru" / WEIGHTS)]
+    with pytest.raises(CommandError, match="expected games like those on which"):
+        write_page(["--model", models[0], "--env-kwargs", "n_agents:5"])
     page = tmp_path / "page.html"
     assert write_page(["--model", *models, "-o", str(page)]).is_file()
     of_other_games = shutil.copytree(published, tmp_path / "teams") / LEVEL / "saf"

@@ -43,7 +43,6 @@ import math
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -276,13 +275,14 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
         env, method, _ = row["cell"].split("/")
         if fnmatchcase(name := f"{env.removesuffix('-default')}/{method}", only):
             best[name] = row
+    if results.damaged:
+        raise ValueError(f"{'; '.join(results.damaged.values())}; the same run command writes them anew")
     if not best:
         raise ValueError(f"expected finished cells of experiments in {folder} that fit {only!r}, got none")
     for name, row in best.items():
         source, team = Run(folder / "cells" / row["cell"]), target / name
         check_runs_no_code(source.description["settings"], source.folder)
-        with closing(source.settings.make_env(source.seed, evaluation=True, n_envs=1)) as games:
-            policy = make_policy(source.settings, source.folder / BEST_MODEL, games)
+        policy = make_policy(source.settings, source.folder / BEST_MODEL)
         shutil.rmtree(team, ignore_errors=True)
         save_weights(policy, team / WEIGHTS)
         returns = read_json(source.folder / "tests" / f"{row['level']}.json")["plays"][0]["returns"]

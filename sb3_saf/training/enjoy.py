@@ -74,10 +74,13 @@ def make_parser() -> argparse.ArgumentParser:
 
 def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
     """Measure, and show the first game meanwhile; return the team returns."""
-    options = make_parser().parse_args(arguments)
+    parser = make_parser()
+    options = parser.parse_args(arguments, argparse.Namespace(env=None, algo=None))
     with user_errors(ValueError, RuntimeError, ImportError):
         seed = check_seed(options.seed)
+        given = {"--env": options.env, "--algo": options.algo}
         if options.team is None:
+            options.env, options.algo = (given[f"--{name}"] or parser.get_default(name) for name in ("env", "algo"))
             find_algorithm(options.algo)
             which = "best" if options.load_best else options.load_checkpoint
             run, path = find_model(
@@ -88,17 +91,16 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
             path = run.folder / WEIGHTS
         with version_in_errors(run):
             trained = run.settings
+        for name, value in zip(given, (trained.env_id, trained.algo), strict=True):
+            if options.team is not None and given[name] not in (None, value):
+                raise ValueError(f"the team {options.team} has {name} {value}, got {given[name]}; leave {name} out")
         options.env = trained.env_id
         settings = saved_settings(trained.as_dict(), options.env_kwargs)
         mode = None if options.no_render else "ansi" if options.text else "rgb_array"
         games = settings.make_env(seed, evaluation=True, n_envs=options.episodes, render_mode=mode)
         with closing(games):
             with version_in_errors(run):
-                if settings.n_agents == trained.n_agents:
-                    policy = make_policy(settings, path, games)
-                else:  # the actor is that of the trained size
-                    with closing(trained.make_env(seed, n_envs=1)) as own_games:
-                        policy = make_policy(trained, path, own_games)
+                policy = make_policy(trained, path, games if settings.env_kwargs == trained.env_kwargs else None)
             games.seed(evaluation_seed(seed, test=0))  # the best model is the best one on the games of evaluations
             load_normalization(games, path)
             set_random_seed(seed)
@@ -117,8 +119,15 @@ def enjoy(arguments: Sequence[str] | None = None) -> EvaluationResult:
     return result
 
 
-def make_policy(settings: Settings, path: Path, games: VecEnv) -> BasePolicy:
-    """Make the policy of the settings with the weights of a model's file, read as numbers only."""
+def make_policy(settings: Settings, path: Path, games: VecEnv | None = None) -> BasePolicy:
+    """
+    Make the policy of the settings with the weights of a model's file, read as numbers only.
+
+    :param games: like those of its training; None to make some, for a policy that is to play others
+    """
+    if games is None:
+        with closing(settings.make_env(0, n_envs=1)) as own_games:
+            return make_policy(settings, path, own_games)
     kwargs = settings.hyperparams.get("policy_kwargs", {})
     policy = settings.spec.policy_class(
         games.observation_space, games.action_space, lr_schedule=lambda progress: 0.0, **kwargs

@@ -61,7 +61,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         seed = evaluation_seed(check_seed(options.seed))
         models = list(dict.fromkeys(options.model))
         paths = [path / WEIGHTS if (path / WEIGHTS).is_file() else path for path in models]
-        settings = [_settings_of(path, options) for path in paths]
+        all_trained = [_settings_of(path, options) for path in paths]
+        settings = [saved_settings(trained.as_dict(), options.env_kwargs) for trained in all_trained]
         suite = settings[0].environment.suite
         levels = [
             {"env": own.env_id, **own.environment.of_evaluation(own.env_kwargs)}
@@ -78,8 +79,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
             settings[0].make_env(options.seed, evaluation=True, n_envs=options.episodes, render_mode=render_mode)
         ) as games:
             players: dict[str, Any] = {
-                name: make_policy(own, path, games)
-                for name, path, own in zip(_names(models), paths, settings, strict=True)
+                name: make_policy(trained, path, games if own.env_kwargs == trained.env_kwargs else None)
+                for name, path, trained, own in zip(_names(models), paths, all_trained, settings, strict=True)
             }
             if any("normalize" in own.wrapping for own in settings) and len(settings) > 1:
                 raise ValueError("a model with normalize is shown alone: its games are normalised with its statistics")
@@ -94,7 +95,7 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
 
 
 def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
-    """Return the settings of a model's run, or those of the command line."""
+    """Return the settings of a model's training, or those of the command line."""
     if not path.exists():
         raise CommandError(f"--model {path} is not there")
     if path.is_dir():
@@ -107,7 +108,7 @@ def _settings_of(path: Path, options: argparse.Namespace) -> Settings:
     trained = run.settings
     if options.env not in (None, trained.env_id):
         raise CommandError(f"{path} was trained on {trained.env_id}, got --env {options.env}; leave --env out")
-    return saved_settings(trained.as_dict(), options.env_kwargs)
+    return trained
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
