@@ -130,7 +130,7 @@ class Battles:
         return won
 
     def first_contact(self, starts: Position) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
-        """Return which battles are won, (E,), and ``in_reach`` after the first hit of each, (E, 2), NaN without one."""
+        """Return which battles are won, (E,), and ``in_reach`` after the first hit of each, (E, 2)."""
         counts = np.full((len(starts.buffers[0]), 2), np.nan)
 
         def watch(position: Position) -> None:

@@ -351,8 +351,10 @@ def check_trained_on(model: Any, env: VecEnv, name: str = "the model", same_size
             "and copy the statistics: stable_baselines3.common.vec_env.sync_envs_normalization(model.get_env(), env)"
         )
     is_normalized, were_normalized = (isinstance(one, NormalizedSpace) for one in (own, trained.own))
-    is_empty = games is None and were_normalized and not all(here)
-    if (is_normalized != were_normalized and own != trained.own) or is_empty:  # the model comes without its games
+    is_empty = were_normalized and not all(here) and isinstance(model, BaseAlgorithm) and model.num_timesteps > 0
+    if (
+        is_normalized != were_normalized and own != trained.own
+    ) or is_empty:  # as of a model that comes without its games
         raise ValueError(
             f"expected observations {'' if were_normalized else 'not '}normalised by VecNormalize, as in the training "
             f"of {name}, got {own}{', without statistics' if is_empty else ''}; wrap the games alike, training=False, "

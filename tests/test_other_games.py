@@ -701,12 +701,14 @@ def test_a_model_without_its_games_tells_that_they_were_normalised(tmp_path: Pat
     statistics = VecNormalize(plain.venv, norm_obs_keys=["obs"], norm_reward=False)
     normal = CentralizedValueWrapper(statistics)
     model = ppo(normal)
-    model.save(tmp_path / "model")
+    assert inspect_team(model, normal, 2), "games of a model that is not trained yet have no statistics"
+    model.learn(16).save(tmp_path / "model")
     loaded = PPO.load(tmp_path / "model")
-    with pytest.raises(ValueError, match="without statistics"):
-        evaluate_team(loaded, normal, 2)
-    normal.reset()
     statistics.training = False
+    fresh = CentralizedValueWrapper(VecNormalize(make_team_env(Alone, 2).venv, norm_obs_keys=["obs"], training=False))
+    for given in (loaded, PPO.load(tmp_path / "model", env=fresh)):
+        with pytest.raises(ValueError, match="without statistics"):
+            evaluate_team(given, fresh, 2)
     assert len(evaluate_team(loaded, normal, 2).returns) == 2
     for play in (lambda: evaluate_team(loaded, plain, 2), lambda: inspect_team(model, plain, 2)):
         with pytest.raises(ValueError, match="expected observations normalised by VecNormalize, as in the training of"):

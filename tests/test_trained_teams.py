@@ -139,11 +139,12 @@ def test_a_damaged_cell_is_not_passed_over(experiments: Path, published: Path, t
     content = curve.read_bytes()
     try:
         curve.write_bytes(content + b"\n")
-        with pytest.raises(ValueError, match=r"curve.csv has changed .* the same run command writes them anew"):
+        with pytest.raises(ValueError, match=r"curve.csv has changed .* the same run command writes it anew"):
             tables.publish(experiments, tmp_path)
+        assert not list(tmp_path.iterdir())
+        assert tables.publish(experiments, tmp_path, only=NAMES[1]) == [NAMES[1]]
     finally:
         curve.write_bytes(content)
-    assert not list(tmp_path.iterdir())
 
 
 def test_published_files_name_no_computer_and_are_small(published: Path) -> None:
@@ -175,11 +176,13 @@ def test_enjoy_and_replay_play_a_team(published: Path, tmp_path: Path, monkeypat
     of_other_games = shutil.copytree(published, tmp_path / "teams") / LEVEL / "saf"
     change(tmp_path / "teams", lambda saved: saved["env_kwargs"].update(coordination=1), f"{LEVEL}/saf")
     both = ["--model", models[0], str(of_other_games), "-o", str(page)]
-    with pytest.raises(CommandError, match="play one game, but coordination was 2, now 1; choose a level with --env-k"):
+    with pytest.raises(CommandError, match="play one game, but coordination was 2, now 1; choose models of one"):
         write_page(both)
     assert write_page([*both, "--env-kwargs", "coordination:2"]).is_file()
     change(tmp_path / "teams", lambda saved: saved.update(frame_stack=2), f"{LEVEL}/saf")
-    with pytest.raises(CommandError, match=r"frame_stack was None, now 2; .* models of equal wrappers"):
+    with pytest.raises(
+        CommandError, match=r"frame_stack was None, now 2; choose models of one task with equal wrappers"
+    ):
         write_page([*both, "--env-kwargs", "coordination:2"])
 
 

@@ -250,6 +250,10 @@ def write_tables(experiment: Experiment, results: Results) -> Frames:
     return frames
 
 
+def _team_name(env: str, method: str) -> str:
+    return f"{env.removesuffix('-default')}/{method}"
+
+
 def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
     """
     Write teams for others to play (``docs/zoo.md``, "Trained teams"): of each task, level and method of a folder of
@@ -272,11 +276,13 @@ def publish(folder: Path, target: Path, only: str = "*") -> list[str]:
         rows += own.assign(experiment=path.parent.name).to_dict("records")
     best = {}
     for row in sorted(rows, key=lambda row: row["return_mean"]):
-        env, method, _ = row["cell"].split("/")
-        if fnmatchcase(name := f"{env.removesuffix('-default')}/{method}", only):
+        name = _team_name(*row["cell"].split("/")[:2])
+        if fnmatchcase(name, only):
             best[name] = row
-    if results.damaged:
-        raise ValueError(f"{'; '.join(results.damaged.values())}; the same run command writes them anew")
+    for path, damage in results.damaged.items():
+        where, *names = path.relative_to(folder).parts
+        if where != "cells" or (names[1] != RANDOM and fnmatchcase(_team_name(*names[:2]), only)):
+            raise ValueError(f"{damage}; the same run command writes it anew")
     if not best:
         raise ValueError(f"expected finished cells of experiments in {folder} that fit {only!r}, got none")
     for name, row in best.items():

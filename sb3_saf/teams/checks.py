@@ -83,20 +83,17 @@ def check_whole_teams(n_rows: int, n_agents: int, fix: str = "pass the right n_a
 
 def import_by_name(module: str, name: str, what: str, hint: str = "") -> Any:
     """Import a callable from a module; the ValueError contains ``what``, and ``hint`` if the module lacks it."""
+    callables: list[str] = []
     try:
         imported = importlib.import_module(module)
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{what}: cannot import {module!r} ({error}); install the package, or set PYTHONPATH to the folder that "
-            "has it"
-        ) from error
-    try:
+        callables += [key for key, value in vars(imported).items() if callable(value)]
         value = getattr(imported, name, None)
-    except ImportError:  # SuperSuit's of a wrapper that it does not have
-        value = None
+    except (ImportError, AttributeError, TypeError, ValueError) as error:  # SuperSuit's, too, for names that it lacks
+        fix = _did_you_mean(name, callables) or "; install the package, or set PYTHONPATH to the folder that has it"
+        raise ValueError(f"{what}: cannot import {module!r} ({error}){fix}") from error
     if not callable(value):
-        got = f"{module}.{name} = {value!r}{hint or _did_you_mean(name, vars(imported))}"
-        raise ValueError(f"{what}: expected a function or class, got {got}")
+        fix = hint or ("" if value is not None else _did_you_mean(name, callables))
+        raise ValueError(f"{what}: expected a function or class, got {module}.{name} = {value!r}{fix}")
     return value
 
 

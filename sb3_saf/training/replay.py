@@ -71,8 +71,8 @@ def write_page(arguments: Sequence[str] | None = None) -> Path:
         ]
         if changed := next(filter(None, (differences(levels[0], level) for level in levels)), ""):
             raise ValueError(
-                f"models side by side play one game, but {changed}; choose a level with --env-kwargs, or models of "
-                "equal wrappers"
+                f"models side by side play one game, but {changed}; choose models of one task with equal wrappers, and "
+                "a level with --env-kwargs"
             )
         render_mode = None if suite is not None and suite.is_drawn_from_state else "rgb_array"
         with closing(

@@ -193,5 +193,6 @@ def load_normalization(env: VecEnv, model: Path) -> None:
             load_normalization_statistics(layer, dict(arrays))
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"cannot read the statistics of normalize in {path}: {error}; if {model} was trained without, leave it out"
+            f"cannot read the statistics of normalize in {path}: {error}; games must have the observations of "
+            f"its training, and no normalize if {model} was trained without"
         ) from error
