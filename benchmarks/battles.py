@@ -102,7 +102,7 @@ class Battles:
         first: Array | None = None,
         planned: tuple[bool, ...] = (),
         planner: tuple[int, int] = (12, 8),
-        watch: Callable[[Position], None] = lambda position: None,
+        watch: Callable[[Position, npt.NDArray[np.bool_]], None] = lambda position, is_over: None,
     ) -> npt.NDArray[np.bool_]:
         """
         Play battles to the end.
@@ -110,7 +110,7 @@ class Battles:
         :param first: (E, N) first actions in the place of the team's
         :param planned: whether a unit has been hit when the planner acts, see ``PLANNED``
         :param planner: candidates and futures of each
-        :param watch: called with the position after each step
+        :param watch: called after each step with the position, and (E,) which battles are over, then new ones follow
         :return: (E,) won
         """
         n = len(position.buffers[0])
@@ -126,15 +126,15 @@ class Battles:
             ended, _, victory = (np.asarray(results)[:, actions.shape[1] :] != 0).T
             won |= victory & ~is_over
             is_over |= ended
-            watch(position)
+            watch(position, is_over)
         return won
 
     def first_contact(self, starts: Position) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
         """Return which battles are won, (E,), and ``in_reach`` after the first hit of each, (E, 2)."""
         counts = np.full((len(starts.buffers[0]), 2), np.nan)
 
-        def watch(position: Position) -> None:
-            new = self.is_hit(position) & np.isnan(counts[:, 0])
+        def watch(position: Position, is_over: npt.NDArray[np.bool_]) -> None:
+            new = self.is_hit(position) & np.isnan(counts[:, 0]) & ~is_over
             counts[new] = self.in_reach(position)[new]
 
         return self.play(starts, deterministic=False, watch=watch), counts
