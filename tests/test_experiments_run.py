@@ -679,6 +679,6 @@ class BoundedEnv(Game):
 
 def test_random_teams_draw_within_the_bounds_of_each_agent(tmp_path: Path) -> None:
     cell = Cell(RANDOM, "tests.test_experiments_run:BoundedEnv", Level.of(), 0, (Level.of(),))
-    result = play(Job(cell, RunConfig("smoke", episodes=128)), Level.of(n_treasures=7), None, tmp_path)
+    result = play(Job(cell, RunConfig("smoke", episodes=128)), Level.of(n_treasures=7), tmp_path)
     np.testing.assert_allclose(result.plays[0].agent_means, [4 * 0.5, 4 * 5], rtol=0.1)
     assert result.max_return is None  # only HECOGrid's is its number of treasures

@@ -16,7 +16,8 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import get_device
 
 from sb3_saf import RandomPolicy
 from sb3_saf.checkpoints.learning import CheckpointFolder
@@ -34,9 +35,10 @@ from sb3_saf.experiments.results import (
     Results,
     write_evaluations,
 )
-from sb3_saf.export.writer import read_weights
+from sb3_saf.export.writer import load_weights, read_weights
 from sb3_saf.teams.checks import CheckpointError, NonFiniteError
 from sb3_saf.teams.files import differences, read_json, remove_leftovers, write_json, write_text
+from sb3_saf.training.enjoy import make_policy
 from sb3_saf.training.folders import (
     CHECKPOINTS,
     CURVE,
@@ -94,32 +96,29 @@ def run_job(folder: Path) -> None:
     """
     job = Job.read(folder)
     th.set_num_threads(job.threads)
-    cell, result, models, model = job.cell, folder / "result", folder, None
+    cell, result = job.cell, folder / "result"
+    models = folder if (folder / MODEL).exists() else result
     (result / "tests").mkdir(parents=True, exist_ok=True)
     remove_leftovers(result / "tests")
-    if (folder / MODEL).exists():
-        model = _load(job)
-    elif cell.is_trained:
-        models, model = result, _train(job, result)
-    else:
+    if not cell.is_trained:
         write_run(result, **job.config.describe(cell), command="")
         finish_run(result, wall_seconds=0.0, processor_seconds=0.0, threads=job.threads)
+    elif models == result:
+        _train(job, result)
     for level in cell.tests:
         path = result / "tests" / f"{level.slug}.json"
         if not path.exists():
-            write_json(path, asdict(play(job, level, model, models)))
+            write_json(path, asdict(play(job, level, models)))
     if (result / RUN_FILE).exists():
         # Only the curves are kept: monitor.csv has hundreds of thousands of lines at the paper's size.
         (result / MONITOR).unlink(missing_ok=True)
         finish_run(result)
 
 
-def _train(job: Job, folder: Path) -> BaseAlgorithm:
+def _train(job: Job, folder: Path) -> None:
     """Train and evaluate a model in the folder of its run, unless that is finished."""
     cell, settings = job.cell, job.config.settings(job.cell)
-    if (folder / FINISHED).exists():
-        model = _load(job)
-    else:
+    if not (folder / FINISHED).exists():
         begun = None
         try:
             begun = CheckpointFolder(folder / CHECKPOINTS).newest()
@@ -137,39 +136,31 @@ def _train(job: Job, folder: Path) -> BaseAlgorithm:
             tensorboard_log=folder / "tb" if job.tensorboard else None,
             device=job.device,
         )
-        model = train(settings, cell.seed, folder, options)
+        train(settings, cell.seed, folder, options)
     shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
     write_evaluations(folder)
-    return model
 
 
-def _load(job: Job) -> BaseAlgorithm:
-    """Make the model of a job; its parameters are loaded from files before it plays."""
-    settings = job.config.settings(job.cell)
-    games = settings.make_env(job.cell.seed)
-    model = settings.make_model(games, job.cell.seed, device=job.device)
-    games.close()
-    return model
-
-
-def play(job: Job, level: Level, model: BaseAlgorithm | None, models: Path) -> LevelResult:
+def play(job: Job, level: Level, models: Path) -> LevelResult:
     """
     Test the best and the last policy at a level, with drawn and with most likely actions.
 
     The games depend on the cell's seed and the level only, so all methods play the same ones; neither training nor its
     evaluations have them.
 
-    :param model: model of the job, whose parameters are replaced; None for a random team
+    :param models: folder of the models of a trained cell
     :raises NonFiniteError: if a return is not finite
     """
     cell, config, settings = job.cell, job.config, job.config.settings(job.cell, level)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=min(TEST_GAMES, config.episodes))
     plays = []
-    player = RandomPolicy(env, seed=cell.seed) if model is None else model
+    player: RandomPolicy | BasePolicy = RandomPolicy(env, seed=cell.seed)
+    if cell.is_trained:
+        player = make_policy(config.settings(cell), models / MODEL).to(get_device(job.device))
     draws = (DRAWN, MOST_LIKELY) if settings.spec.draws_actions else (MOST_LIKELY,)
     for policy, actions in product((BEST, LAST), draws) if cell.is_trained else [(BEST, DRAWN)]:
-        if model is not None and actions == draws[0]:
-            model.policy.load_state_dict(read_weights(models / (BEST_MODEL if policy == BEST else MODEL)))
+        if isinstance(player, BasePolicy) and actions == draws[0]:
+            load_weights(player, models / (BEST_MODEL if policy == BEST else MODEL))
         clock = time.perf_counter()
         result = play_test(player, env, cell.seed, config.episodes, actions == MOST_LIKELY)
         if not np.isfinite(result.returns).all():
