@@ -166,16 +166,6 @@ def test_samples_follow_the_mixture(space: spaces.Space[Any]) -> None:
     assert space.contains(np.asarray(sampled[0].numpy().reshape(space.shape), dtype=space.dtype))
 
 
-def test_parameters_as_sb3_calls_them() -> None:
-    log_weights, parameters = random_mixture(MULTI_DISCRETE)
-    mixture = PoolDistribution(MULTI_DISCRETE)
-    assert th.equal(mixture.actions_from_params(log_weights, parameters, deterministic=True), mixture.mode())
-    actions, log_prob = mixture.log_prob_from_params(log_weights, parameters)
-    assert th.equal(log_prob, mixture.log_prob(actions))
-    with pytest.raises(NotImplementedError, match="PolicyPool"):
-        mixture.proba_distribution_net()
-
-
 def test_unknown_action_spaces_are_refused() -> None:
     with pytest.raises(ValueError, match=r"expected a Discrete, MultiDiscrete .* or Box space, got"):
         n_action_parameters(spaces.Text(3))

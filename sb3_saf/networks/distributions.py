@@ -24,7 +24,6 @@ from stable_baselines3.common.distributions import (
     kl_divergence,
     make_proba_distribution,
 )
-from torch import nn
 from torch.distributions import Categorical, Normal, register_kl
 from torch.distributions import Distribution as TorchDistribution
 from torch.nn import functional as F
@@ -331,19 +330,10 @@ class PoolDistribution(Distribution):
         """Return the most likely joint action (B, D), or the likeliest policy's mode if they cannot be enumerated."""
         return mixture_mode(self.action_space, self.log_weights, self.parameters)
 
-    def proba_distribution_net(self, *args: Any, **kwargs: Any) -> nn.Module:
-        """Raise an error: the networks are those of ``sb3_saf.networks.actor.PolicyPool``."""
-        raise NotImplementedError("the parameters of a pool's distribution come from sb3_saf.networks.actor.PolicyPool")
+    def _unused(self, *_: Any, **__: Any) -> Any:  # abstract in SB3, which calls them in off-policy algorithms only
+        raise NotImplementedError
 
-    def actions_from_params(self, *args: Any, deterministic: bool = False, **kwargs: Any) -> th.Tensor:
-        """Set the parameters (see ``proba_distribution``) and act."""
-        self.proba_distribution(*args, **kwargs)
-        return self.get_actions(deterministic=deterministic)
-
-    def log_prob_from_params(self, *args: Any, **kwargs: Any) -> tuple[th.Tensor, th.Tensor]:
-        """Set the parameters (see ``proba_distribution``), sample, and return the sample and its log-likelihood."""
-        actions = self.actions_from_params(*args, **kwargs)
-        return actions, self.log_prob(actions)
+    proba_distribution_net = actions_from_params = log_prob_from_params = _unused
 
 
 class SelectedDistribution(PoolDistribution):
