@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import obs_as_tensor
 
 from benchmarks.memory import share_right, trained
-from sb3_saf import CentralizedValueWrapper, InspectionCallback, TeamRolloutBuffer, evaluate_team, make_team_env
+from sb3_saf import QPLEX, CentralizedValueWrapper, InspectionCallback, TeamRolloutBuffer, evaluate_team, make_team_env
 from sb3_saf.inspection.recording import record_episodes
 from sb3_saf.networks.memory import Memory
 from tests.team_venv import TeamVenv
@@ -368,6 +368,11 @@ def test_states_of_other_rows_and_masks_that_no_row_has_are_refused() -> None:
     for wrong in (state[:-1], np.tile(state, (2, 1)), state[:, :8]):
         with pytest.raises(ValueError, match=r"expected a state of shape \(9, 16\), a row for each observation, got"):
             model.predict(obs, (wrong,))
+    qplex = QPLEX("QPLEXPolicy", make_env(), policy_kwargs={"memory": "gru", "memory_size": 16})
+    _, parts = qplex.predict(obs)
+    assert parts is not None
+    with pytest.raises(ValueError, match=r"expected a state of shape \(9, 16\), a row for each observation, got"):
+        qplex.predict(obs, tuple(part[:-1] for part in parts))
     with pytest.raises(ValueError, match="without masks of actions: leave them out"):
         model.policy.predict(obs, (state,), action_masks=np.ones((9, 5)))
 

@@ -62,15 +62,19 @@ class Memory(nn.Module):
             return self._from_start_to_start(inputs, memory, starts)
 
     def _compiled(self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor | None) -> th.Tensor:
-        if memory.shape != (shape := (inputs.shape[1], self.state_dim)):  # the kernels do not look
-            raise ValueError(
-                f"expected a state of shape {shape}, a row for each observation, got {tuple(memory.shape)}; pass the "
-                "state that was returned for these rows, or None where episodes begin"
-            )
+        self.check_state(memory, inputs.shape[1])  # the kernels do not look
         of_input, of_memory, input_bias, memory_bias = self.rnn.parameters()
         of_inputs = nn.functional.linear(inputs, of_input, input_bias)
         memories: th.Tensor = _Recurrence.apply(of_inputs, memory, starts, of_memory, memory_bias)
         return memories
+
+    def check_state(self, memory: th.Tensor, n_rows: int) -> None:
+        """Raise a ValueError unless there is a memory for each row."""
+        if memory.shape != (shape := (n_rows, self.state_dim)):
+            raise ValueError(
+                f"expected a state of shape {shape}, a row for each observation, got {tuple(memory.shape)}; pass the "
+                "state that was returned for these rows, or None where episodes begin"
+            )
 
     def _from_start_to_start(
         self, inputs: th.Tensor, memory: th.Tensor, starts: th.Tensor | None

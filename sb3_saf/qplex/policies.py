@@ -361,6 +361,7 @@ class QPLEXPolicy(TeamRowsPolicy):
         else:
             starts = self._starts(obs, episode_start)
             memory, last = (th.as_tensor(part, device=features.device) for part in state)
+            net.check_state(memory, len(features))
         agent = self._agent(obs)
         inputs = net.inputs(features, last.long().masked_fill(starts, -1), agent)
         latents, memory = net.step(inputs, memory, starts)
