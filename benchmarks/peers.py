@@ -355,8 +355,8 @@ def print_trainings(clones: Mapping[str, Path | None], interpreters: Mapping[str
         with tempfile.TemporaryDirectory() as folder:
             options = argparse.Namespace(folder=Path(folder))
             with contextlib.redirect_stdout(sys.stderr):
-                suite_results.run(task, 0, options)
-            tests = suite_results.read_results(Path(folder, task.name), task.name).tests
+                results = suite_results.run(task, 0, options)
+            tests = suite_results.read_results(results, task.name).tests
         (test,) = tests[tests["method"] == "mappo"].to_dict("records")
         _print_row(peer.task, "MAPPO", test["game_steps"], test["return_mean"], test["processor_seconds"])
 

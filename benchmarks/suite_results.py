@@ -110,12 +110,14 @@ TASKS: Final = (
 )
 
 
-def run(task: Task, seed: int, options: argparse.Namespace) -> None:
-    """Train and test the missing cells of a task and seed, one after the other."""
+def run(task: Task, seed: int, options: argparse.Namespace) -> Path:
+    """Train and test the missing cells of a task and seed, one after the other, and return their folder."""
+    folder: Path = options.folder / task.trainings
     words = ["run", task.name, "--env", task.env_id, "--size", "small", "--workers", "1", "--seeds", str(seed)]
-    words += ["-n", str(task.game_steps), "--methods", *task.methods, "-f", str(options.folder / task.trainings)]
+    words += ["-n", str(task.game_steps), "--methods", *task.methods, "-f", str(folder)]
     words += ["-params", *task.settings] if task.settings else []
     experiments([*words, "--env-kwargs", *task.params] if task.params else words)
+    return folder
 
 
 def beside(task: Task, baselines: pd.DataFrame) -> Iterator[tuple[str, str, float | None]]:
@@ -150,13 +152,14 @@ def _over_seeds(values: pd.Series) -> str:
 
 def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
     """Yield the lines of the table, of the notes on others' results, and of the tasks that were not trained yet."""
-    head = ["task", "game steps", "method", "best policy", "others", "last policy", "random", "seeds", "minutes"]
+    head = ["task", "game steps", "method", "best policy", "others", "most likely", "last policy", "random", "seeds"]
+    head += ["minutes"]
     yield f"| {' | '.join(head)} |"
     yield f"|{' --- |' * len(head)}"
     baselines = pd.read_csv(BASELINES)
     notes: list[str] = []
     commits: set[str] = set()
-    missing = []
+    missing, seconds = [], 0.0
     for task in tasks:
         others = []
         for result, note, _ in beside(task, baselines):
@@ -172,12 +175,14 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
             here = tests[tests["method"] == method]
             cells = [f"`{task.game}`", f"{task.game_steps:,}", _in_short(method)]
             if here.empty:
-                yield f"| {' | '.join([*cells, 'not trained', '; '.join(others), '', f'{random:.2f}', '0', ''])} |"
+                yield f"| {' | '.join([*cells, 'not trained', '; '.join(others), '', '', f'{random:.2f}', '0', ''])} |"
                 continue
+            seconds += here["processor_seconds"].sum()
             won = "" if here["success_rate"].isna().any() else f", {here['success_rate'].mean():.0%} won"
             cells += [
                 f"**{_over_seeds(here['return_mean'])}**{won}",
                 "; ".join(others),
+                _over_seeds(here["return_most_likely"]),
                 _over_seeds(here["return_last"]),
             ]
             cells += [f"{random:.2f}", str(len(here)), f"{here['processor_seconds'].mean() / 60:.0f}"]
@@ -186,7 +191,7 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
     yield from (f"{number}. {note}" for number, note in enumerate(notes, 1))
     yield ""
     untrained = f"Not trained yet: {', '.join(missing)}. " if missing else ""
-    yield f"{untrained}Commits: {', '.join(sorted(commits))}."
+    yield f"{untrained}{seconds / 3600:.0f} core-hours of training. Commits: {', '.join(sorted(commits))}."
 
 
 def figure(tasks: Iterable[Task], folder: Path) -> Figure:

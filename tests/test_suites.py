@@ -140,8 +140,8 @@ def test_the_table_of_results_is_that_of_the_raw_data(tmp_path: Path) -> None:
     *_, missing = table(TASKS, tmp_path)
     assert all(f"`{task.game}` (" in missing for task in TASKS)
     assert {task.env_id.partition("/")[0] for task in TASKS} <= set(suites())
-    assert "`mpe/simple_spread_v3` (-59.5 (1))" in missing
-    assert "** | -59.5 (1) |" in page and "1. XuanCe's MAPPO (continuous actions) after 1,000,000" in page
+    assert "`mpe/simple_spread_v3` (-59.5 (1); -47.4 (2))" in missing
+    assert "** | -59.5 (1); -47.4 (2) |" in page and "1. XuanCe's MAPPO (continuous actions) after 1,000,000" in page
 
 
 # --- every task -------------------------------------------------------------------------------------------------------
@@ -450,8 +450,8 @@ def test_a_result_stands_beside_what_is_known_of_its_task() -> None:
     spread = find_environment("mpe/simple_spread_v3")
     assert {one.task for one in references(spread)} == {"mpe/simple_spread_v3"}
     place = standing(spread, {}, {"return": -64.1}, 1_000_000)
-    assert place is not None and place.share == pytest.approx((78.9 - 64.1) / (78.9 - 59.5))
-    for words in ("sum over agents: -64.1", "random -78.9", "MAPPO (continuous actions) -59.5 after 1,000,000", "76%"):
+    assert place is not None and place.share == pytest.approx((78.9 - 64.1) / (78.9 - 47.4))
+    for words in ("sum over agents: -64.1", "random -78.9", "XuanCe's VDAC -47.4 after 1,000,000", "47%"):
         assert words in place.text
     early = standing(spread, {}, {"return": -80.0}, 90_000)
     assert early is not None and "-73 after 100,000" in early.text and early.text.endswith("below random")
