@@ -12,6 +12,7 @@ from ``python -m benchmarks.peers``, are in ``results/suites_baselines.csv``; pu
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -33,12 +34,13 @@ METHODS: Final = ("saf", "mappo", "ippo")
 SEEDS: Final = (0, 1, 2)
 PAGE: Final = Path("results", "suites.md")
 RAW: Final = Path("results", "field")
+TEAMS: Final = Path("trained_teams")
 
 #: Game steps of trainings whose curves are drawn.
 _LONG: Final = 1_000_000
 _MEMORY: Final = "-gru"
 #: Shapes the rewards of training only.
-_SHAPING: Final = "reward_shaping_steps:"
+_SHAPING: Final = "reward_shaping"
 
 
 class Task(NamedTuple):
@@ -150,13 +152,23 @@ def _over_seeds(values: pd.Series) -> str:
     return f"{value:.2f} [{low:.2f}, {high:.2f}]"
 
 
+def _teams() -> dict[tuple[str, int, str], Path]:
+    """Return the folders of published teams by game, game steps and method."""
+    found: dict[tuple[str, int, str], Path] = {}
+    for path in sorted(TEAMS.glob("*/*/run.json")):
+        settings = json.loads(path.read_text(encoding="utf-8"))["settings"]
+        trained = Task(settings["env"], 0, params=tuple(f"{key}:{one}" for key, one in settings["env_kwargs"].items()))
+        found[trained.game, settings["game_steps"], settings["algo"]] = path.parent
+    return found
+
+
 def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
     """Yield the lines of the table, of the notes on others' results, and of the tasks that were not trained yet."""
     head = ["task", "game steps", "method", "best policy", "others", "most likely", "last policy", "random", "seeds"]
     head += ["minutes"]
     yield f"| {' | '.join(head)} |"
     yield f"|{' --- |' * len(head)}"
-    baselines = pd.read_csv(BASELINES)
+    baselines, teams = pd.read_csv(BASELINES), _teams()
     notes: list[str] = []
     commits: set[str] = set()
     missing, seconds = [], 0.0
@@ -173,7 +185,9 @@ def table(tasks: Iterable[Task], folder: Path) -> Iterator[str]:
         random = tests[tests["method"] == RANDOM]["return_mean"].mean()
         for method in task.methods:
             here = tests[tests["method"] == method]
-            cells = [f"`{task.game}`", f"{task.game_steps:,}", _in_short(method)]
+            team = teams.get((task.game, task.game_steps, method))
+            name = _in_short(method) if team is None else f"[{_in_short(method)}](../{team.as_posix()})"
+            cells = [f"`{task.game}`", f"{task.game_steps:,}", name]
             if here.empty:
                 yield f"| {' | '.join([*cells, 'not trained', '; '.join(others), '', '', f'{random:.2f}', '0', ''])} |"
                 continue

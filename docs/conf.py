@@ -95,6 +95,7 @@ def _copy_pages() -> None:
         shutil.copytree(ROOT / folder, docs / pages, ignore=shutil.ignore_patterns("*.py*", "__*"))
         for copied in [*(docs / pages).rglob("*.md"), *(docs / pages).rglob("*.ipynb")]:
             text = copied.read_text(encoding="utf-8").replace("../docs/", "../")
+            text = text.replace("](../trained_teams/", f"]({_address}/tree/main/trained_teams/")
             # A report is reached from the page that it belongs to, not from the sidebar.
             is_report = copied.name == "report.md"
             copied.write_text("---\norphan: true\n---\n\n" + text if is_report else text, encoding="utf-8")
