@@ -154,9 +154,11 @@ def play(job: Job, level: Level, models: Path) -> LevelResult:
     cell, config, settings = job.cell, job.config, job.config.settings(job.cell, level)
     env = settings.make_env(cell.seed, evaluation=True, n_envs=min(TEST_GAMES, config.episodes))
     plays = []
-    player: RandomPolicy | BasePolicy = RandomPolicy(env, seed=cell.seed)
+    player: RandomPolicy | BasePolicy
     if cell.is_trained:
         player = make_policy(config.settings(cell), models / MODEL).to(get_device(job.device))
+    else:
+        player = RandomPolicy(env, seed=cell.seed)
     draws = (DRAWN, MOST_LIKELY) if settings.spec.draws_actions else (MOST_LIKELY,)
     for policy, actions in product((BEST, LAST), draws) if cell.is_trained else [(BEST, DRAWN)]:
         if isinstance(player, BasePolicy) and actions == draws[0]:
