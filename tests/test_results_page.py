@@ -7,8 +7,9 @@ import shutil
 from pathlib import Path
 
 import pandas as pd
+import pytest
 
-from benchmarks import paper, suite_results
+from benchmarks import paper, peers, suite_results
 from sb3_saf.experiments.tables import CURVES, RUNS, marl_eval
 
 
@@ -69,3 +70,15 @@ def test_trainings_of_others_stand_beside_those_of_similar_length() -> None:
     rows = [{"task": task.game, "program": "P", "game_steps": steps, "return": -1.0} for steps in lengths]
     notes = [note for _, note, _ in suite_results.beside(task, pd.DataFrame(rows)) if note.startswith("P")]
     assert [note.split()[2] for note in notes] == ["500,000", "2,000,000"]
+
+
+def test_whole_trainings_are_read_where_they_were_written(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train(words: list[str]) -> None:
+        published = suite_results.RAW / "lbf-Foraging-15x15-4p-3f-v3"
+        shutil.copytree(published, Path(words[words.index("-f") + 1], words[1]))
+
+    monkeypatch.setattr(suite_results, "experiments", train)
+    peers.print_trainings(dict.fromkeys((peer.kind for peer in peers.RATED), None), {})
+    assert capsys.readouterr().out.count("| MAPPO | 5,000,000 | 0.51 | 4683 |") == len(peers.RATED)
